@@ -1,0 +1,4 @@
+//! The `rare` program.
+#![forbid(unsafe_code)]
+
+fn main() {}

@@ -1,0 +1,89 @@
+//! Points with a feature vector each.
+
+use nalgebra::Point3;
+
+use crate::error::{Error, Result};
+
+/// `N` points (metres, in their cloud's own frame) and an `N x dimension` row-major matrix of their features.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointFeatures {
+    points: Vec<Point3<f64>>,
+    dimension: usize,
+    values: Vec<f32>,
+}
+
+impl PointFeatures {
+    /// Takes points and their features, row by row.
+    ///
+    /// # Errors
+    /// `InvalidInput` if the number of values is not points times dimension.
+    pub fn new(
+        points: Vec<Point3<f64>>,
+        dimension: usize,
+        values: Vec<f32>,
+    ) -> Result<PointFeatures> {
+        if points.len().checked_mul(dimension) != Some(values.len()) {
+            return Err(Error::invalid(format!(
+                "{} points with {dimension} features each need {} values, there are {}",
+                points.len(),
+                points.len().saturating_mul(dimension),
+                values.len()
+            )));
+        }
+        Ok(PointFeatures { points, dimension, values })
+    }
+
+    /// No points.
+    #[must_use]
+    pub fn empty(dimension: usize) -> PointFeatures {
+        PointFeatures { points: Vec::new(), dimension, values: Vec::new() }
+    }
+
+    /// Number of points.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether there is no point.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// Length of a feature vector.
+    #[must_use]
+    pub fn dimension(&self) -> usize {
+        self.dimension
+    }
+
+    /// The points, in their cloud's own frame, metres.
+    #[must_use]
+    pub fn points(&self) -> &[Point3<f64>] {
+        &self.points
+    }
+
+    /// The features, row-major, `len x dimension`.
+    #[must_use]
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+
+    /// The feature vector of point `index` (empty if there is no such point).
+    #[must_use]
+    pub fn feature(&self, index: usize) -> &[f32] {
+        self.values.get(index * self.dimension..(index + 1) * self.dimension).unwrap_or(&[])
+    }
+
+    /// The points and features at `indices`, in that order; indices out of range are passed over.
+    #[must_use]
+    pub fn select(&self, indices: &[usize]) -> PointFeatures {
+        let kept: Vec<usize> =
+            indices.iter().copied().filter(|&index| index < self.len()).collect();
+        PointFeatures {
+            points: kept.iter().map(|&index| self.points[index]).collect(),
+            dimension: self.dimension,
+            values: kept.iter().flat_map(|&index| self.feature(index)).copied().collect(),
+        }
+    }
+}

@@ -1,0 +1,10 @@
+//! Integration tests: one binary, one module per concern.
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::print_stdout,
+    reason = "tests fail by panicking and say what they skip"
+)]
+
+mod shared;
