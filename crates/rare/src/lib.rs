@@ -4,6 +4,8 @@
 pub mod data;
 pub mod error;
 pub mod random;
+pub mod scale;
+pub mod viewpoints;
 
 pub use data::{
     Camera, Correspondence, DepthMap, FeatureMap, Intrinsics, PointCloud, PointFeatures,

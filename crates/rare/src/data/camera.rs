@@ -57,3 +57,20 @@ pub struct Camera {
     /// The pose: moves points of the world into the camera's frame.
     pub camera_from_world: RigidTransform,
 }
+
+/// An interval of depths along the camera's axis, metres.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DepthRange {
+    /// Nearest depth, exclusive.
+    pub minimum: f64,
+    /// Farthest depth, exclusive.
+    pub maximum: f64,
+}
+
+impl DepthRange {
+    /// Whether a depth lies strictly inside.
+    #[must_use]
+    pub fn contains(&self, depth: f64) -> bool {
+        depth > self.minimum && depth < self.maximum
+    }
+}

@@ -8,8 +8,9 @@ mod feature_map;
 mod point_features;
 mod transform;
 
-pub use camera::{Camera, Intrinsics};
+pub use camera::{Camera, DepthRange, Intrinsics};
 pub use cloud::PointCloud;
+pub(crate) use cloud::bounds;
 pub use correspondence::Correspondence;
 pub use depth_map::DepthMap;
 pub use feature_map::{FeatureMap, LayeredFeatures};
