@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 pub mod data;
+pub mod densify;
 pub mod error;
 pub mod project;
 pub mod random;

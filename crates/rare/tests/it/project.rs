@@ -12,7 +12,7 @@ const DEPTH_TOLERANCE: f32 = 1e-6;
 /// The stored true pose is a rotation only to 5e-5 (it was printed from `f32`): made a rotation, it moves depths by
 /// up to 1e-4 m, and some points over the border of a pixel.
 const RIGID_DEPTH_TOLERANCE: f32 = 1.2e-4;
-const RIGID_PIXELS: usize = 60;
+const RIGID_PIXELS: usize = 120;
 
 fn intrinsics(k: &Array, width: usize, height: usize) -> Intrinsics {
     let k = Matrix3::from_row_slice(&k.values);
