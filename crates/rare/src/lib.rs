@@ -2,7 +2,9 @@
 #![forbid(unsafe_code)]
 
 pub mod data;
+pub mod densify;
 pub mod error;
+pub mod project;
 pub mod random;
 pub mod scale;
 pub mod viewpoints;

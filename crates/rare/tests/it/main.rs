@@ -7,4 +7,6 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod densify;
+mod project;
 mod shared;
