@@ -7,4 +7,5 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod matching;
 mod shared;
