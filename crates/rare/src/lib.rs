@@ -5,6 +5,7 @@ pub mod data;
 pub mod error;
 pub mod matching;
 pub mod random;
+pub mod transfer;
 
 pub use data::{
     Camera, Correspondence, DepthMap, FeatureMap, Intrinsics, PointCloud, PointFeatures,

@@ -194,7 +194,7 @@ fn check_locality(
             target.len()
         )));
     }
-    if !(locality.max_distance > 0.0) {
+    if locality.max_distance.is_nan() || locality.max_distance <= 0.0 {
         return Err(Error::invalid(format!(
             "the matching window is {} m: it must be greater than 0",
             locality.max_distance

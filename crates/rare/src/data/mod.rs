@@ -5,6 +5,7 @@ mod cloud;
 mod correspondence;
 mod depth_map;
 mod feature_map;
+mod kd_tree;
 mod point_features;
 mod transform;
 
@@ -13,5 +14,7 @@ pub use cloud::PointCloud;
 pub use correspondence::Correspondence;
 pub use depth_map::DepthMap;
 pub use feature_map::{FeatureMap, LayeredFeatures};
+pub use kd_tree::{KdTree, Neighbour};
 pub use point_features::PointFeatures;
+pub(crate) use point_features::normalise;
 pub use transform::{PoseError, RigidTransform};

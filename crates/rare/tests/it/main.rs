@@ -9,3 +9,4 @@
 
 mod matching;
 mod shared;
+mod transfer;
