@@ -3,6 +3,8 @@
 
 pub mod data;
 pub mod error;
+pub mod features;
+pub mod pose;
 pub mod random;
 
 pub use data::{

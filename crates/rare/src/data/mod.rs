@@ -5,13 +5,17 @@ mod cloud;
 mod correspondence;
 mod depth_map;
 mod feature_map;
+mod kd_tree;
 mod point_features;
 mod transform;
+mod voxel_grid;
 
 pub use camera::{Camera, Intrinsics};
 pub use cloud::PointCloud;
 pub use correspondence::Correspondence;
 pub use depth_map::DepthMap;
 pub use feature_map::{FeatureMap, LayeredFeatures};
+pub use kd_tree::{KdTree, Neighbour};
 pub use point_features::PointFeatures;
 pub use transform::{PoseError, RigidTransform};
+pub use voxel_grid::{resolution, voxel_downsample};

@@ -8,3 +8,4 @@
 )]
 
 mod shared;
+mod weighted_fit;
