@@ -3,7 +3,9 @@
 
 pub mod data;
 pub mod error;
+pub mod features;
 pub mod matching;
+pub mod pose;
 pub mod random;
 pub mod transfer;
 

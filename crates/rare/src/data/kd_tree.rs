@@ -20,6 +20,17 @@ pub struct Neighbour {
 }
 
 impl Neighbour {
+    /// Point `index` of the indexed `points` as a query at `point` finds it, distance to the last bit.
+    pub(crate) fn of(
+        points: &[Point3<f64>],
+        index: usize,
+        point: &Point3<f64>,
+    ) -> Option<Neighbour> {
+        let offset = points.get(index)? - point;
+        let squared_distance = squared_length(&[offset.x, offset.y, offset.z]);
+        Some(Neighbour { index, squared_distance })
+    }
+
     /// The order of all results: by distance, ties by the lowest index. Nothing precedes or follows a NaN.
     fn precedes(&self, other: &Neighbour) -> bool {
         self.squared_distance < other.squared_distance

@@ -8,6 +8,7 @@ mod feature_map;
 mod kd_tree;
 mod point_features;
 mod transform;
+mod voxel_grid;
 
 pub use camera::{Camera, Intrinsics};
 pub use cloud::PointCloud;
@@ -18,3 +19,4 @@ pub use kd_tree::{KdTree, Neighbour};
 pub use point_features::PointFeatures;
 pub(crate) use point_features::normalise;
 pub use transform::{PoseError, RigidTransform};
+pub use voxel_grid::{resolution, voxel_downsample};

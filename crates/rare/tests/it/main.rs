@@ -10,3 +10,4 @@
 mod matching;
 mod shared;
 mod transfer;
+mod weighted_fit;
