@@ -2,6 +2,7 @@
 
 use nalgebra::Point3;
 
+use crate::data::RigidTransform;
 use crate::error::{Error, Result};
 
 /// `N` points (metres, in their cloud's own frame) and an `N x dimension` row-major matrix of their features.
@@ -86,4 +87,30 @@ impl PointFeatures {
             values: kept.iter().flat_map(|&index| self.feature(index)).copied().collect(),
         }
     }
+
+    /// The same features at points moved into another frame.
+    #[must_use]
+    pub fn transformed(mut self, other_from_this: &RigidTransform) -> PointFeatures {
+        for point in &mut self.points {
+            *point = other_from_this.apply(point);
+        }
+        self
+    }
+
+    /// Appends a point; its feature is cut, or filled up with zeros, to the dimension.
+    pub(crate) fn push(&mut self, point: Point3<f64>, feature: impl IntoIterator<Item = f32>) {
+        self.points.push(point);
+        self.values.extend(feature.into_iter().take(self.dimension));
+        self.values.resize(self.points.len() * self.dimension, 0.0);
+    }
+}
+
+/// What is added to norms before dividing by them (FreeReg).
+const NORM_EPSILON: f64 = 1e-5;
+
+/// A feature vector divided by its Euclidean norm + 1e-5.
+pub(crate) fn normalise(feature: &[f32]) -> impl Iterator<Item = f32> + '_ {
+    let squared_norm: f64 = feature.iter().map(|&value| f64::from(value).powi(2)).sum();
+    let scale = (1.0 / (squared_norm.sqrt() + NORM_EPSILON)) as f32;
+    feature.iter().map(move |value| value * scale)
 }

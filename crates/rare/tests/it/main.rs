@@ -7,6 +7,12 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+<<<<<<< HEAD
 mod densify;
 mod project;
+=======
+mod matching;
+>>>>>>> matching
 mod shared;
+mod transfer;
+mod weighted_fit;

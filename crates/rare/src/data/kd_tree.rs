@@ -1,0 +1,400 @@
+//! An exact kd-tree over 3-D points: nearest, k nearest within a radius, all within a radius.
+//!
+//! Points are copied once, reordered so that a leaf is one run of memory. Nodes are split at the median position (not
+//! at a value), so that the depth is logarithmic whatever the points are, millions of copies of one point included.
+//! One traversal serves all queries: it offers every point that precedes a shrinking bound in the order (distance,
+//! index), which makes ties, and with them every result, independent of the shape of the tree.
+
+use nalgebra::Point3;
+
+/// Points per leaf. Measured on voxel-sampled scans: 8 to 16 are equally fast, 32 is slower.
+const LEAF_SIZE: usize = 12;
+
+/// A point found by a query.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Neighbour {
+    /// Position of the point in the slice that the tree was built from.
+    pub index: usize,
+    /// Squared distance to the query, square metres.
+    pub squared_distance: f64,
+}
+
+impl Neighbour {
+    /// Point `index` of the indexed `points` as a query at `point` finds it, distance to the last bit.
+    pub(crate) fn of(
+        points: &[Point3<f64>],
+        index: usize,
+        point: &Point3<f64>,
+    ) -> Option<Neighbour> {
+        let offset = points.get(index)? - point;
+        let squared_distance = squared_length(&[offset.x, offset.y, offset.z]);
+        Some(Neighbour { index, squared_distance })
+    }
+
+    /// The order of all results: by distance, ties by the lowest index. Nothing precedes or follows a NaN.
+    fn precedes(&self, other: &Neighbour) -> bool {
+        self.squared_distance < other.squared_distance
+            || (self.squared_distance == other.squared_distance && self.index < other.index)
+    }
+
+    /// The bound that is preceded by everything closer than `radius`.
+    fn closer_than(radius: f64) -> Neighbour {
+        Neighbour { index: 0, squared_distance: radius * radius }
+    }
+}
+
+/// A point as the leaves keep it.
+#[derive(Debug, Clone, Copy)]
+struct Entry {
+    position: [f64; 3],
+    index: u32,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Node {
+    /// The entries `begin..end`.
+    Leaf { begin: u32, end: u32 },
+    /// The left child follows at once, the right one stands at `right`. Along `axis` the left points end at
+    /// `left_max` and the right ones begin at `right_min`.
+    Split { axis: u8, right: u32, left_max: f64, right_min: f64 },
+}
+
+/// An exact nearest-neighbour index over at most `2^32 - 1` points (further ones are not indexed).
+#[derive(Debug, Clone)]
+pub struct KdTree {
+    entries: Vec<Entry>,
+    nodes: Vec<Node>,
+    /// The lowest point index below each node: tells whether a subtree at exactly the bound's distance can matter.
+    lowest: Vec<u32>,
+}
+
+impl KdTree {
+    /// Indexes `points`; `O(n log n)`.
+    #[must_use]
+    pub fn new(points: &[Point3<f64>]) -> KdTree {
+        let mut entries: Vec<Entry> = (0..u32::MAX)
+            .zip(points)
+            .map(|(index, point)| Entry { position: [point.x, point.y, point.z], index })
+            .collect();
+        let mut tree = KdTree { entries: Vec::new(), nodes: Vec::new(), lowest: Vec::new() };
+        if !entries.is_empty() {
+            tree.split(&mut entries, 0);
+        }
+        tree.entries = entries;
+        tree
+    }
+
+    /// Number of points.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// Whether there is no point.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+
+    /// The indices of all points in the order of the leaves: neighbours in space are close in this order.
+    pub fn leaf_order(&self) -> impl ExactSizeIterator<Item = usize> + '_ {
+        self.entries.iter().map(|entry| entry.index as usize)
+    }
+
+    /// The point closest to `point`; `None` only if the tree is empty or `point` is not finite.
+    #[must_use]
+    pub fn nearest(&self, point: &Point3<f64>) -> Option<Neighbour> {
+        self.nearest_within(point, f64::INFINITY)
+    }
+
+    /// The point closest to `point` among those closer than `radius` (metres).
+    #[must_use]
+    pub fn nearest_within(&self, point: &Point3<f64>, radius: f64) -> Option<Neighbour> {
+        self.first_before(point, Neighbour::closer_than(radius))
+    }
+
+    /// As [`KdTree::nearest_within`], where a good guess is known: `guess` (its true distance to `point`) is returned
+    /// unless another point precedes it. The same result, found sooner.
+    #[must_use]
+    pub fn nearest_from(&self, point: &Point3<f64>, guess: Neighbour) -> Neighbour {
+        self.first_before(point, guess).unwrap_or(guess)
+    }
+
+    /// The `k` closest points among those closer than `radius` (metres), by distance, then index. Replaces the
+    /// content of `found`.
+    pub fn k_nearest_within(
+        &self,
+        point: &Point3<f64>,
+        k: usize,
+        radius: f64,
+        found: &mut Vec<Neighbour>,
+    ) {
+        self.k_nearest_unordered(point, k, radius, found);
+        found.sort_unstable_by(order);
+    }
+
+    /// As [`KdTree::k_nearest_within`], in an order that is arbitrary but always the same: a good part faster.
+    pub fn k_nearest_unordered(
+        &self,
+        point: &Point3<f64>,
+        k: usize,
+        radius: f64,
+        found: &mut Vec<Neighbour>,
+    ) {
+        found.clear();
+        if k == 0 {
+            return;
+        }
+        // Collect up to twice as many as wanted, then drop the farther half: constant work per candidate.
+        let full = k.saturating_mul(2);
+        self.search(point, Neighbour::closer_than(radius), |candidate, bound| {
+            found.push(candidate);
+            if found.len() >= full {
+                *bound = keep_closest(found, k);
+            }
+        });
+        if found.len() > k {
+            keep_closest(found, k);
+        }
+    }
+
+    /// All points closer than `radius` (metres), by distance, then index. Replaces the content of `found`.
+    pub fn within(&self, point: &Point3<f64>, radius: f64, found: &mut Vec<Neighbour>) {
+        self.k_nearest_within(point, usize::MAX, radius, found);
+    }
+
+    fn first_before(&self, point: &Point3<f64>, bound: Neighbour) -> Option<Neighbour> {
+        let mut first = None;
+        self.search(point, bound, |candidate, bound| {
+            first = Some(candidate);
+            *bound = candidate;
+        });
+        first
+    }
+
+    /// Offers every point that precedes the bound; `offer` may lower it.
+    fn search(
+        &self,
+        point: &Point3<f64>,
+        bound: Neighbour,
+        mut offer: impl FnMut(Neighbour, &mut Neighbour),
+    ) {
+        let mut bound = bound;
+        if !self.nodes.is_empty() {
+            self.visit(0, &[point.x, point.y, point.z], [0.0; 3], &mut bound, &mut offer);
+        }
+    }
+
+    /// `offset` is how far the query is from the node's region along each axis.
+    fn visit(
+        &self,
+        node: usize,
+        query: &[f64; 3],
+        offset: [f64; 3],
+        bound: &mut Neighbour,
+        offer: &mut impl FnMut(Neighbour, &mut Neighbour),
+    ) {
+        match self.nodes[node] {
+            Node::Leaf { begin, end } => {
+                for entry in &self.entries[begin as usize..end as usize] {
+                    let candidate = entry.seen_from(query);
+                    if candidate.precedes(bound) {
+                        offer(candidate, bound);
+                    }
+                }
+            }
+            Node::Split { axis, right, left_max, right_min } => {
+                let axis = usize::from(axis);
+                let beyond_left = query[axis] - left_max;
+                let before_right = right_min - query[axis];
+                let left = (node + 1, beyond_left);
+                let right = (right as usize, before_right);
+                let (near, far) =
+                    if beyond_left <= before_right { (left, right) } else { (right, left) };
+                for (child, gap) in [near, far] {
+                    let mut offset = offset;
+                    offset[axis] = offset[axis].max(gap);
+                    // Summed like the distance of a point, so that rounding can never hide one.
+                    let closest = Neighbour {
+                        squared_distance: squared_length(&offset),
+                        index: self.lowest[child] as usize,
+                    };
+                    if closest.precedes(bound) {
+                        self.visit(child, query, offset, bound, offer);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Appends the subtree over `entries`, which will stand at `begin`; returns their lowest index.
+    fn split(&mut self, entries: &mut [Entry], begin: u32) -> u32 {
+        let node = self.nodes.len();
+        let end = begin + entries.len() as u32;
+        self.nodes.push(Node::Leaf { begin, end });
+        self.lowest.push(0);
+        let lowest = if entries.len() <= LEAF_SIZE {
+            entries.iter().map(|entry| entry.index).min().unwrap_or(0)
+        } else {
+            let axis = widest_axis(entries);
+            let middle = entries.len() / 2;
+            entries.select_nth_unstable_by(middle, |a, b| {
+                a.position[axis].total_cmp(&b.position[axis]).then(a.index.cmp(&b.index))
+            });
+            let (left, right) = entries.split_at_mut(middle);
+            let left_max = fold_axis(left, axis, f64::max);
+            let right_min = fold_axis(right, axis, f64::min);
+            let lowest_left = self.split(left, begin);
+            let right_node = self.nodes.len() as u32;
+            let lowest_right = self.split(right, begin + middle as u32);
+            self.nodes[node] =
+                Node::Split { axis: axis as u8, right: right_node, left_max, right_min };
+            lowest_left.min(lowest_right)
+        };
+        self.lowest[node] = lowest;
+        lowest
+    }
+}
+
+impl Entry {
+    fn seen_from(&self, query: &[f64; 3]) -> Neighbour {
+        let [x, y, z] = self.position;
+        let offset = [x - query[0], y - query[1], z - query[2]];
+        Neighbour { index: self.index as usize, squared_distance: squared_length(&offset) }
+    }
+}
+
+fn squared_length([x, y, z]: &[f64; 3]) -> f64 {
+    x * x + y * y + z * z
+}
+
+fn order(a: &Neighbour, b: &Neighbour) -> std::cmp::Ordering {
+    a.squared_distance.total_cmp(&b.squared_distance).then(a.index.cmp(&b.index))
+}
+
+/// Drops all but the first `k` (1 to `found.len()`) and returns the last one kept.
+fn keep_closest(found: &mut Vec<Neighbour>, k: usize) -> Neighbour {
+    let (_, last, _) = found.select_nth_unstable_by(k - 1, order);
+    let last = *last;
+    found.truncate(k);
+    last
+}
+
+fn fold_axis(entries: &[Entry], axis: usize, choose: fn(f64, f64) -> f64) -> f64 {
+    entries.iter().map(|entry| entry.position[axis]).fold(f64::NAN, choose)
+}
+
+/// The axis along which the points spread most.
+fn widest_axis(entries: &[Entry]) -> usize {
+    let mut low = [f64::INFINITY; 3];
+    let mut high = [f64::NEG_INFINITY; 3];
+    for entry in entries {
+        for axis in 0..3 {
+            low[axis] = low[axis].min(entry.position[axis]);
+            high[axis] = high[axis].max(entry.position[axis]);
+        }
+    }
+    let spread = |axis: usize| high[axis] - low[axis];
+    let first = if spread(1) > spread(0) { 1 } else { 0 };
+    if spread(2) > spread(first) { 2 } else { first }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::random::Random;
+
+    fn brute_force(points: &[Point3<f64>], query: &Point3<f64>, radius: f64) -> Vec<Neighbour> {
+        let mut all: Vec<Neighbour> = points
+            .iter()
+            .enumerate()
+            .map(|(index, point)| {
+                let offset = point - query;
+                Neighbour {
+                    index,
+                    squared_distance: squared_length(&[offset.x, offset.y, offset.z]),
+                }
+            })
+            .filter(|neighbour| neighbour.squared_distance < radius * radius)
+            .collect();
+        all.sort_by(order);
+        all
+    }
+
+    /// Points on a coarse lattice, so that equal distances and identical points are common.
+    fn lattice(max: usize) -> impl Strategy<Value = Vec<Point3<f64>>> {
+        prop::collection::vec(prop::array::uniform3(-4_i32..4), 0..max).prop_map(|cells| {
+            cells.iter().map(|c| Point3::from(c.map(|x| f64::from(x) * 0.1))).collect()
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn every_query_agrees_with_brute_force(
+            points in lattice(300),
+            query in prop::array::uniform3(-5_i32..5),
+            radius in 0.0..0.9_f64,
+            k in 0_usize..40,
+        ) {
+            let query = Point3::from(query.map(|x| f64::from(x) * 0.1));
+            let tree = KdTree::new(&points);
+            let all = brute_force(&points, &query, f64::INFINITY);
+            let near = brute_force(&points, &query, radius);
+            let mut found = Vec::new();
+            tree.within(&query, radius, &mut found);
+            prop_assert_eq!(&found, &near);
+            tree.k_nearest_within(&query, k, radius, &mut found);
+            prop_assert_eq!(&found[..], &near[..k.min(near.len())]);
+            prop_assert_eq!(tree.nearest(&query), all.first().copied());
+            prop_assert_eq!(tree.nearest_within(&query, radius), near.first().copied());
+            if let Some(&guess) = all.get(k) {
+                prop_assert_eq!(tree.nearest_from(&query, guess), all[0]);
+            }
+        }
+    }
+
+    #[test]
+    fn scattered_points_agree_with_brute_force() {
+        let mut random = Random::new(5, 0);
+        let mut point = || Point3::from([random.normal(), 3.0 * random.normal(), random.normal()]);
+        let points: Vec<_> = (0..3000).map(|_| point()).collect();
+        let tree = KdTree::new(&points);
+        let mut found = Vec::new();
+        for _ in 0..200 {
+            let query = point();
+            tree.k_nearest_within(&query, 40, 0.8, &mut found);
+            let expected = brute_force(&points, &query, 0.8);
+            assert_eq!(found[..], expected[..expected.len().min(40)]);
+            assert_eq!(
+                tree.nearest(&query),
+                brute_force(&points, &query, f64::INFINITY).first().copied()
+            );
+        }
+    }
+
+    /// A search that visited all copies for each query would take hours here.
+    #[test]
+    fn identical_points_stay_cheap() {
+        let points = vec![Point3::new(1.0, 2.0, 3.0); 400_000];
+        let tree = KdTree::new(&points);
+        let mut found = Vec::new();
+        for _ in 0..20_000 {
+            assert_eq!(tree.nearest(&points[0]).unwrap().index, 0);
+            tree.k_nearest_within(&points[0], 30, 1.0, &mut found);
+            assert!(found.iter().map(|neighbour| neighbour.index).eq(0..30));
+        }
+    }
+
+    #[test]
+    fn odd_queries_find_nothing() {
+        assert_eq!(KdTree::new(&[]).nearest(&Point3::origin()), None);
+        let tree = KdTree::new(&[Point3::origin(), Point3::new(f64::NAN, 0.0, 0.0)]);
+        assert_eq!(tree.nearest(&Point3::new(f64::NAN, 0.0, 0.0)), None);
+        assert_eq!(tree.nearest_within(&Point3::origin(), 0.0), None);
+        assert_eq!(tree.nearest_within(&Point3::origin(), f64::NAN), None);
+        assert_eq!(tree.nearest(&Point3::new(9.0, 0.0, 0.0)).unwrap().index, 0);
+        assert!(tree.leaf_order().eq(0..2));
+    }
+}

@@ -1,0 +1,45 @@
+//! Pose estimators: correspondences in, a rigid transform with evidence out.
+
+mod icp;
+mod normal_equations;
+mod rigid_fit;
+mod robust_kernel;
+
+pub use icp::{Icp, IcpResult, IcpStage, IcpTarget};
+pub use rigid_fit::fit_weighted;
+pub use robust_kernel::RobustKernel;
+
+use crate::data::{Correspondence, PointCloud, RigidTransform};
+use crate::error::Result;
+
+/// Estimates the rigid transform between two clouds from correspondences of which many may be wrong.
+pub trait PoseEstimator: Send + Sync {
+    /// The transform that moves `source` onto `target`, in their local frames, from `pairs` of their points (metres).
+    ///
+    /// # Errors
+    /// `InvalidInput` if a setting of the estimator makes no sense, `NoPose` if the pairs do not determine a pose.
+    fn estimate(
+        &self,
+        source: &PointCloud,
+        target: &PointCloud,
+        pairs: &[Correspondence],
+    ) -> Result<PoseEstimate>;
+}
+
+/// A pose and what speaks for it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseEstimate {
+    /// Moves points of the source into the target's frame.
+    pub target_from_source: RigidTransform,
+    /// Indices (ascending) of the pairs that agree with the pose.
+    pub inliers: Vec<usize>,
+    /// The estimator's own measure of agreement, higher is better; comparable only within one estimator and one set.
+    pub score: f64,
+    /// The score of the best pose that differs from this one; `None` if there was no other. A small gap warns of an
+    /// ambiguous scene.
+    pub runner_up: Option<f64>,
+    /// Hypotheses that were formed and scored.
+    pub iterations: usize,
+    /// Whether the work ended at a limit rather than at the estimator's own criterion.
+    pub budget_exhausted: bool,
+}
