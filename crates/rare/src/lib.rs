@@ -3,19 +3,20 @@
 
 pub mod data;
 pub mod densify;
+pub mod depth_features;
+pub mod encode;
 pub mod error;
-<<<<<<< HEAD
-pub mod project;
-pub mod random;
-pub mod scale;
-pub mod viewpoints;
-=======
 pub mod features;
+pub mod io;
 pub mod matching;
 pub mod pose;
+pub mod project;
 pub mod random;
+pub mod refine;
+pub mod scale;
 pub mod transfer;
->>>>>>> matching
+pub mod verify;
+pub mod viewpoints;
 
 pub use data::{
     Camera, Correspondence, DepthMap, FeatureMap, Intrinsics, PointCloud, PointFeatures,

@@ -37,7 +37,7 @@ pub enum SceneKind {
     Object,
 }
 
-/// Every length and count that depends on the scale of the scene. Lengths in the clouds' unit (metres).
+/// Every length and count that depends on the scale of the scene, in metres.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scale {
     /// What the clouds look like.

@@ -7,6 +7,7 @@ mod depth_map;
 mod feature_map;
 mod kd_tree;
 mod point_features;
+mod scan;
 mod transform;
 mod voxel_grid;
 
@@ -19,5 +20,6 @@ pub use feature_map::{FeatureMap, LayeredFeatures};
 pub use kd_tree::{KdTree, Neighbour};
 pub use point_features::PointFeatures;
 pub(crate) use point_features::normalise;
+pub use scan::Scan;
 pub use transform::{PoseError, RigidTransform};
 pub use voxel_grid::{resolution, voxel_downsample};

@@ -7,12 +7,9 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
-<<<<<<< HEAD
 mod densify;
-mod project;
-=======
 mod matching;
->>>>>>> matching
+mod project;
 mod shared;
 mod transfer;
 mod weighted_fit;
