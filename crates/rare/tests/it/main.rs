@@ -7,7 +7,9 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod aggregate;
 mod matching;
+mod metrics;
 mod shared;
 mod transfer;
 mod weighted_fit;
