@@ -72,7 +72,7 @@ fn scatter(points: &[Point3<f64>], centre: &Point3<f64>, found: &[Neighbour]) ->
 /// best comes first, the others are sought in its orthogonal complement.
 fn smallest_eigenvector(matrix: &Matrix3<f64>) -> Vector3<f64> {
     let scale = matrix.amax();
-    if !(scale > 0.0 && scale.is_finite()) {
+    if scale == 0.0 || matrix.iter().any(|value| !value.is_finite()) {
         return Vector3::zeros();
     }
     let matrix = matrix / scale;

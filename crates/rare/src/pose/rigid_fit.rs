@@ -62,7 +62,7 @@ where
 /// The rotation `R` that maximises `trace(R H)`; `None` if the rank of `H` is below 2 or a number is not finite.
 fn best_rotation(covariance: &Matrix3<f64>) -> Option<Rotation3<f64>> {
     let scale = covariance.amax();
-    if !(scale > 0.0 && scale.is_finite()) {
+    if scale == 0.0 || covariance.iter().any(|value| !value.is_finite()) {
         return None;
     }
     // H V = U S
