@@ -1,6 +1,7 @@
 //! Registration refinement for point clouds after RARE (ICCV 2025).
 #![forbid(unsafe_code)]
 
+pub mod aggregate;
 pub mod data;
 pub mod densify;
 pub mod depth_features;
@@ -8,6 +9,7 @@ pub mod encode;
 pub mod error;
 pub mod features;
 pub mod io;
+pub mod fuse;
 pub mod matching;
 pub mod pose;
 pub mod project;
@@ -19,8 +21,8 @@ pub mod verify;
 pub mod viewpoints;
 
 pub use data::{
-    Camera, Correspondence, DepthMap, FeatureMap, Intrinsics, PointCloud, PointFeatures,
-    RigidTransform,
+    Camera, Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap,
+    Intrinsics, PointCloud, PointFeatures, RigidTransform, SetName,
 };
 pub use error::{Error, Result};
 pub use nalgebra;

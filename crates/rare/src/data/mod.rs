@@ -3,6 +3,7 @@
 mod camera;
 mod cloud;
 mod correspondence;
+mod correspondence_sets;
 mod depth_map;
 mod feature_map;
 mod kd_tree;
@@ -15,6 +16,7 @@ pub use camera::{Camera, DepthRange, Intrinsics};
 pub use cloud::PointCloud;
 pub(crate) use cloud::bounds;
 pub use correspondence::Correspondence;
+pub use correspondence_sets::{CorrespondenceSet, CorrespondenceSets, SetName};
 pub use depth_map::DepthMap;
 pub use feature_map::{FeatureMap, LayeredFeatures};
 pub use kd_tree::{KdTree, Neighbour};

@@ -10,6 +10,9 @@
 mod densify;
 mod matching;
 mod project;
+mod aggregate;
+mod matching;
+mod metrics;
 mod shared;
 mod transfer;
 mod weighted_fit;

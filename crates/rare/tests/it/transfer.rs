@@ -1,6 +1,7 @@
 //! Steps 5 and 6 against the golden keypoints, samples, common points and fused features.
 
 use nalgebra::{Point3, Rotation3, Vector3};
+use rare::fuse::fuse;
 use rare::transfer::{self, DepthRange};
 use rare::{DepthMap, FeatureMap, Intrinsics, PointFeatures, RigidTransform};
 
@@ -8,6 +9,11 @@ use crate::shared::{Array, Golden};
 
 fn pixels(array: &Array) -> Vec<(usize, usize)> {
     array.usize().chunks_exact(2).map(|pixel| (pixel[0], pixel[1])).collect()
+}
+
+fn features(golden: &mut Golden, points: &str, values: &str) -> PointFeatures {
+    let (points, values) = (golden.array(points).points(), golden.array(values));
+    PointFeatures::new(points, values.shape[1], values.f32()).unwrap()
 }
 
 fn assert_near(found: &[f32], expected: &[f64], tolerance: f64) {
@@ -74,6 +80,22 @@ fn golden_common_points() {
         let squared = (query[i] - keypoints[j]).norm_squared();
         assert!((squared - distances[i]).abs() < 1e-6);
     }
+}
+
+#[test]
+fn golden_fused_features() {
+    let Some(mut golden) = Golden::open("rare/s7_transfer.npz") else { return };
+    let keypoints = features(&mut golden, "query_xyz", "feat3d");
+    let lifted = features(&mut golden, "keypoint_xyz", "keypoint_feat");
+    let common = transfer::common_points(keypoints.points(), lifted.points(), 0.05);
+    let fused = fuse(&keypoints, &lifted, &common);
+    let expected = golden.array("fused_common");
+    assert_eq!([fused.len(), fused.dimension()], expected.shape[..]);
+    assert_near(fused.values(), &expected.values, 1e-5);
+    let first_common = common[0].0;
+    assert_eq!(fused.points()[0], keypoints.points()[first_common]);
+    // Indices that do not exist give no row.
+    assert_eq!(fuse(&keypoints, &lifted, &[(500, 0), (0, 1399), (3, 7)]).len(), 1);
 }
 
 #[test]
