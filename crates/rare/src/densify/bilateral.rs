@@ -4,60 +4,75 @@ use std::f32::consts::LOG2_E;
 
 use super::image::Image;
 
-/// The taps within two pixels of the middle but for the middle itself: (row, column) of the 5 x 5 window, and the
+/// The taps within two pixels of the middle but for the middle itself, by the rows of the 5 x 5 window: column and
 /// squared distance.
-const TAPS: [(usize, usize, f32); 12] = [
-    (0, 2, 4.0),
-    (1, 1, 2.0),
-    (1, 2, 1.0),
-    (1, 3, 2.0),
-    (2, 0, 4.0),
-    (2, 1, 1.0),
-    (2, 3, 1.0),
-    (2, 4, 4.0),
-    (3, 1, 2.0),
-    (3, 2, 1.0),
-    (3, 3, 2.0),
-    (4, 2, 4.0),
+const TAPS: [&[(usize, f32)]; 5] = [
+    &[(2, 4.0)],
+    &[(1, 2.0), (2, 1.0), (3, 2.0)],
+    &[(0, 4.0), (1, 1.0), (3, 1.0), (4, 4.0)],
+    &[(1, 2.0), (2, 1.0), (3, 2.0)],
+    &[(2, 4.0)],
 ];
 
-/// Pixels outside mirror those inside without repeating the edge: `dcb|abcd|cba`.
-fn reflect(index: isize, side: usize) -> usize {
-    let last = side as isize - 1;
-    let index = if index > last { 2 * last - index } else { index.abs() };
-    index.clamp(0, last) as usize
+/// Where the pixel `index - 2` of a side is taken from: pixels outside mirror those inside without repeating the edge,
+/// `dcb|abcd|cba`.
+fn reflect(index: usize, side: usize) -> usize {
+    let last = side.saturating_sub(1);
+    let inside = index.abs_diff(2);
+    let mirrored = if inside > last { (2 * last).saturating_sub(inside) } else { inside };
+    mirrored.min(last)
 }
 
 /// Averages each pixel with those within two pixels (`OpenCV`'s diameter 5), each weighted by
 /// exp(-distance^2 / (2 `sigma_space`^2) - difference^2 / (2 `sigma_value`^2)); pixels outside mirror those inside.
 ///
 /// `sigma_space` is in pixels, `sigma_value` in the unit of the values.
-#[must_use]
-pub fn bilateral5(image: &Image, sigma_value: f32, sigma_space: f32) -> Image {
-    let padded = image.padded(2, reflect);
+pub fn bilateral5(image: &mut Image, sigma_value: f32, sigma_space: f32) {
     let by_value = -LOG2_E / (2.0 * sigma_value * sigma_value);
     let by_distance = -LOG2_E / (2.0 * sigma_space * sigma_space);
+    let mut padded = vec![0.0; image.width() + 4];
     let mut weights = vec![0.0; image.width()];
-    image.build_rows(|y, sums| {
-        let centre = image.row(y);
-        sums.copy_from_slice(centre);
+    image.rewrite_rows(|image, y, sums| {
+        let centres = image.row(y);
+        sums.copy_from_slice(centres);
         weights.fill(1.0);
-        for (row, column, squared_distance) in TAPS {
-            let tap = &padded.row(y + row)[column..];
-            let offset = by_distance * squared_distance;
-            for (((sum, weights), &tap), &centre) in
-                sums.iter_mut().zip(&mut weights).zip(tap).zip(centre)
-            {
-                let difference = tap - centre;
-                let weight = exp2(by_value * difference * difference + offset);
-                *sum += weight * tap;
-                *weights += weight;
+        for (row, taps) in TAPS.iter().enumerate() {
+            pad(image.row(reflect(y + row, image.height())), &mut padded);
+            for &(column, squared_distance) in *taps {
+                let offset = by_distance * squared_distance;
+                let weight = |difference| exp2(by_value * difference * difference + offset);
+                add_tap(&padded[column..], centres, sums, &mut weights, weight);
             }
         }
         for (sum, &weight) in sums.iter_mut().zip(&weights) {
             *sum /= weight;
         }
-    })
+    });
+}
+
+/// Copies a row with two more pixels on each side.
+fn pad(row: &[f32], padded: &mut [f32]) {
+    let width = row.len();
+    padded[2..2 + width].copy_from_slice(row);
+    for outside in [0, 1, width + 2, width + 3] {
+        padded[outside] = row[reflect(outside, width)];
+    }
+}
+
+/// Adds a tap of each pixel to the weighted sums.
+fn add_tap(
+    taps: &[f32],
+    centres: &[f32],
+    sums: &mut [f32],
+    weights: &mut [f32],
+    weight: impl Fn(f32) -> f32,
+) {
+    let totals = sums.iter_mut().zip(weights);
+    for ((sum, total), (&tap, &centre)) in totals.zip(taps.iter().zip(centres)) {
+        let weight = weight(tap - centre);
+        *sum += weight * tap;
+        *total += weight;
+    }
 }
 
 /// 2 to the power of `x <= 0`, to 2e-7 of the value; what is below 2^-126 becomes 2^-126.

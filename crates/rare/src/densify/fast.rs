@@ -9,22 +9,24 @@ const SIGMA_SPACE: f32 = 2.0;
 
 /// Densifies depths in metres; what stays empty ends below 0.1. `observe` sees the image after each step.
 pub(super) fn densify(
-    depth: Image,
+    image: &mut Image,
     max_depth: f32,
     observe: &mut dyn FnMut(&'static str, &Image),
-) -> Image {
-    let mut step = |name, image: Image| {
-        observe(name, &image);
-        image
-    };
-    let inverted = step("invert", depth.map(|depth| invert(depth, max_depth)));
-    let dilated = step("dilate", dilate_diamond(&inverted));
-    let closed = step("close", close_full::<5>(&dilated));
-    let around = dilate_full::<7>(&closed);
-    let filled =
-        closed.zip_map(&around, |value, around| if value < EMPTY { around } else { value });
-    let filled = step("fill", filled);
-    let median = step("median", median5(&filled));
-    let smooth = step("bilateral", bilateral5(&median, SIGMA_VALUE, SIGMA_SPACE));
-    step("revert", smooth.map(|value| revert(value, max_depth)))
+) {
+    image.map(|depth| invert(depth, max_depth));
+    observe("invert", image);
+    dilate_diamond(image);
+    observe("dilate", image);
+    close_full::<5>(image);
+    observe("close", image);
+    let mut around = image.clone();
+    dilate_full::<7>(&mut around);
+    image.zip_map(&around, |value, around| if value < EMPTY { around } else { value });
+    observe("fill", image);
+    median5(image);
+    observe("median", image);
+    bilateral5(image, SIGMA_VALUE, SIGMA_SPACE);
+    observe("bilateral", image);
+    image.map(|value| revert(value, max_depth));
+    observe("revert", image);
 }

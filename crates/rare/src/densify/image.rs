@@ -3,10 +3,14 @@
 use crate::error::{Error, Result};
 
 /// One channel of `f32`, row-major.
-#[derive(Debug, Clone, PartialEq)]
+///
+/// A filter cannot work in place. An image therefore keeps the memory that its last filter read from for the next one
+/// to write to: fresh memory would cost more than most filters do.
+#[derive(Debug)]
 pub struct Image {
     width: usize,
     values: Vec<f32>,
+    spare: Vec<f32>,
 }
 
 impl Image {
@@ -21,12 +25,12 @@ impl Image {
                 values.len()
             )));
         }
-        Ok(Image { width, values })
+        Ok(Image::from_rows(width, values))
     }
 
     /// Takes whole rows of `width` values each.
     pub(super) fn from_rows(width: usize, values: Vec<f32>) -> Image {
-        Image { width, values }
+        Image { width, values, spare: Vec::new() }
     }
 
     /// Columns.
@@ -52,57 +56,42 @@ impl Image {
         &mut self.values
     }
 
-    /// Gives the values away.
-    #[must_use]
-    pub fn into_values(self) -> Vec<f32> {
-        self.values
-    }
-
     pub(super) fn row(&self, y: usize) -> &[f32] {
         &self.values[y * self.width..(y + 1) * self.width]
     }
 
-    /// Each value by itself.
-    #[must_use]
-    pub(super) fn map(mut self, change: impl Fn(f32) -> f32) -> Image {
-        self.values.iter_mut().for_each(|value| *value = change(*value));
-        self
+    /// Takes the values of an image of the same size.
+    pub(super) fn copy_from(&mut self, other: &Image) {
+        self.values.copy_from_slice(&other.values);
     }
 
-    /// Each value together with that of the same pixel of `other`, an image of the same size.
-    #[must_use]
-    pub(super) fn zip_map(mut self, other: &Image, change: impl Fn(f32, f32) -> f32) -> Image {
+    /// Changes each value by itself.
+    pub(super) fn map(&mut self, change: impl Fn(f32) -> f32) {
+        self.values.iter_mut().for_each(|value| *value = change(*value));
+    }
+
+    /// Changes each value by itself and that of the same pixel of `other`, an image of the same size.
+    pub(super) fn zip_map(&mut self, other: &Image, change: impl Fn(f32, f32) -> f32) {
         for (value, &other) in self.values.iter_mut().zip(&other.values) {
             *value = change(*value, other);
         }
-        self
     }
 
-    /// Builds an image of the same size row by row: `fill(y, row)` writes row `y`.
-    #[must_use]
-    pub(super) fn build_rows(&self, mut fill: impl FnMut(usize, &mut [f32])) -> Image {
-        let mut values = vec![0.0; self.values.len()];
+    /// Replaces the image row by row: `rewrite(image, y, row)` writes row `y` from the image as it was.
+    pub(super) fn rewrite_rows(&mut self, mut rewrite: impl FnMut(&Image, usize, &mut [f32])) {
+        let mut rows = std::mem::take(&mut self.spare);
+        rows.resize(self.values.len(), 0.0);
         if self.width > 0 {
-            values.chunks_exact_mut(self.width).enumerate().for_each(|(y, row)| fill(y, row));
-        }
-        Image { width: self.width, values }
-    }
-
-    /// A larger image with `margin` more pixels on each side, taken from where `source` says: it maps an index that
-    /// may lie outside (first number) of a side of so many pixels (second) to one inside.
-    #[must_use]
-    pub(super) fn padded(&self, margin: usize, source: impl Fn(isize, usize) -> usize) -> Image {
-        let (width, height) = (self.width, self.height());
-        let mut values = Vec::with_capacity((width + 2 * margin) * (height + 2 * margin));
-        let outside = |index: usize, side| source(index as isize - margin as isize, side);
-        if !self.values.is_empty() {
-            for y in 0..height + 2 * margin {
-                let row = self.row(outside(y, height));
-                values.extend((0..margin).map(|x| row[outside(x, width)]));
-                values.extend_from_slice(row);
-                values.extend((0..margin).map(|x| row[outside(margin + width + x, width)]));
+            for (y, row) in rows.chunks_exact_mut(self.width).enumerate() {
+                rewrite(self, y, row);
             }
         }
-        Image { width: width + 2 * margin, values }
+        self.spare = std::mem::replace(&mut self.values, rows);
+    }
+}
+
+impl Clone for Image {
+    fn clone(&self) -> Image {
+        Image::from_rows(self.width, self.values.clone())
     }
 }

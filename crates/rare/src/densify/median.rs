@@ -23,40 +23,41 @@ macro_rules! sorting_network {
     };
 }
 
-/// Pixels outside repeat the edge.
-fn replicate(index: isize, side: usize) -> usize {
-    index.clamp(0, side as isize - 1) as usize
-}
-
-/// The 13th of the 25 values around each pixel; pixels outside repeat the edge.
-#[must_use]
-pub fn median5(image: &Image) -> Image {
-    let padded = image.padded(2, replicate);
-    let mut ranks: [Vec<f32>; 5] = from_fn(|_| vec![0.0; padded.width()]);
-    image.build_rows(|y, out| {
-        sort_columns(from_fn(|row| padded.row(y + row)), &mut ranks);
+/// Every pixel becomes the 13th of the 25 values around it; pixels outside repeat the edge.
+pub fn median5(image: &mut Image) {
+    let mut ranks: [Vec<f32>; 5] = from_fn(|_| vec![0.0; image.width() + 4]);
+    image.rewrite_rows(|image, y, row| {
+        let last = image.height() - 1;
+        sort_columns(from_fn(|k| image.row((y + k).saturating_sub(2).min(last))), &mut ranks);
         let [a, b, c, d, e] = &ranks;
         let windows = a
-            .array_windows::<5>()
-            .zip(b.array_windows::<5>())
-            .zip(c.array_windows::<5>())
-            .zip(d.array_windows::<5>())
-            .zip(e.array_windows::<5>());
-        for (out, ((((a, b), c), d), e)) in out.iter_mut().zip(windows) {
-            *out = median_of_sorted_columns([a, b, c, d, e]);
+            .array_windows()
+            .zip(b.array_windows())
+            .zip(c.array_windows())
+            .zip(d.array_windows())
+            .zip(e.array_windows());
+        for (value, ((((a, b), c), d), e)) in row.iter_mut().zip(windows) {
+            *value = median_of_sorted_columns([a, b, c, d, e]);
         }
-    })
+    });
 }
 
-/// Sorts what stands above each other in five rows: `ranks[k]` holds the `k`-th smallest of every column.
+/// Sorts what stands above each other in five rows: `ranks[k]` holds the `k`-th smallest of every column, with the
+/// outermost columns repeated twice on each side.
 fn sort_columns(rows: [&[f32]; 5], ranks: &mut [Vec<f32>; 5]) {
-    let [a, b, c, d, e] = ranks;
-    let ranks = a.iter_mut().zip(b).zip(c).zip(d).zip(e);
+    let width = rows[0].len();
+    let [a, b, c, d, e] = ranks.each_mut().map(|rank| &mut rank[2..2 + width]);
+    let sorted = a.iter_mut().zip(b).zip(c).zip(d).zip(e);
     let columns = rows[0].iter().zip(rows[1]).zip(rows[2]).zip(rows[3]).zip(rows[4]);
-    for (((((a, b), c), d), e), ((((&p, &q), &r), &s), &t)) in ranks.zip(columns) {
+    for (((((a, b), c), d), e), ((((&p, &q), &r), &s), &t)) in sorted.zip(columns) {
         let mut v = [p, q, r, s, t];
         sorting_network!(v: 0 3, 1 4, 0 2, 1 3, 0 1, 2 4, 1 2, 3 4, 2 3);
         [*a, *b, *c, *d, *e] = v;
+    }
+    for rank in ranks {
+        let (first, last) = (rank[2], rank[width + 1]);
+        rank[..2].fill(first);
+        rank[width + 2..].fill(last);
     }
 }
 

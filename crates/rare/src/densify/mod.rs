@@ -84,18 +84,18 @@ impl Densifier {
         observe: &mut dyn FnMut(&'static str, &Image),
     ) -> DepthMap {
         let max_depth = options.max_depth.unwrap_or(self.default_max_depth());
-        let sparse = Image::from_rows(map.width(), map.depth().to_vec());
-        let dense = match self {
-            Densifier::Fast => fast::densify(sparse, max_depth, observe),
-            Densifier::Multiscale => multiscale::densify(&sparse, max_depth, observe),
-            Densifier::None => sparse,
-        };
+        let mut image = Image::from_rows(map.width(), map.depth().to_vec());
+        match self {
+            Densifier::Fast => fast::densify(&mut image, max_depth, observe),
+            Densifier::Multiscale => multiscale::densify(&mut image, max_depth, observe),
+            Densifier::None => {}
+        }
         let hole = match options.holes {
             Holes::Zero => 0.0,
             Holes::FarAway => max_depth * 51.0 / 20.0,
         };
         let mut filled = DepthMap::empty(*map.intrinsics());
-        for (filled, &depth) in filled.depth_mut().iter_mut().zip(dense.values()) {
+        for (filled, &depth) in filled.depth_mut().iter_mut().zip(image.values()) {
             *filled = if depth >= EMPTY { depth } else { hole };
         }
         filled

@@ -14,83 +14,112 @@ const FILL_ROUNDS: usize = 6;
 
 /// Densifies depths in metres; what stays empty ends below 0.1. `observe` sees the image after each step.
 pub(super) fn densify(
-    depth: &Image,
+    image: &mut Image,
     max_depth: f32,
     observe: &mut dyn FnMut(&'static str, &Image),
-) -> Image {
-    let mut step = |name, image: Image| {
-        observe(name, &image);
-        image
-    };
-    let inverted = step("invert", depth.clone().map(|depth| invert(depth, max_depth)));
-    let dilated = step("dilate", dilate_by_range(depth, &inverted, max_depth));
-    let closed = step("close", close_full::<5>(&dilated));
-    let median = median5(&closed);
-    let median =
-        closed.zip_map(&median, |value, median| if value > EMPTY { median } else { value });
-    let median = step("median", median);
-    let extended = step("fill columns", fill::<9>(median.clone(), &below_top(&median)));
-    let mask = step("top mask", below_top(&extended));
-    let filled = (0..FILL_ROUNDS).fold(extended, |image, _| fill::<5>(image, &mask));
-    let filled = step("fill gaps", filled);
-    let valid =
-        filled.clone().zip_map(&mask, |value, inside| if value > EMPTY { inside } else { 0.0 });
-    let smooth = replace(filled.clone(), &valid, &median5(&filled));
-    let smooth = step("second median", smooth);
-    let bilateral = bilateral5(&smooth, SIGMA_VALUE, SIGMA_SPACE);
-    let smooth = step("bilateral", replace(smooth, &valid, &bilateral));
-    step("revert", smooth.map(|value| revert(value, max_depth)))
+) {
+    let depth = image.clone();
+    // What a filter makes of the image, where only some pixels take it.
+    let mut filtered = image.clone();
+    image.map(|depth| invert(depth, max_depth));
+    observe("invert", image);
+    dilate_by_range(image, &depth, &mut filtered, max_depth);
+    observe("dilate", image);
+    close_full::<5>(image);
+    observe("close", image);
+    filtered.copy_from(image);
+    median5(&mut filtered);
+    image.zip_map(&filtered, |value, median| if value > EMPTY { median } else { value });
+    observe("median", image);
+    let mut mask = depth;
+    fill_columns(image, &mut mask, &mut filtered, observe);
+    smooth(image, &mut mask, &mut filtered, observe);
+    image.map(|value| revert(value, max_depth));
+    observe("revert", image);
 }
 
 /// Dilates the far, middle and near range each with its own cross, near over middle over far.
-fn dilate_by_range(depth: &Image, inverted: &Image, max_depth: f32) -> Image {
+fn dilate_by_range(image: &mut Image, depth: &Image, range: &mut Image, max_depth: f32) {
     let (near_end, middle_end) = (max_depth * 3.0 / 20.0, max_depth * 3.0 / 10.0);
-    let range = |from: f32, to: f32| {
-        inverted.clone().zip_map(
-            depth,
-            |value, depth| {
-                if depth > from && depth <= to { value } else { 0.0 }
-            },
-        )
+    let mut spread = |from: f32, to: f32, dilate: fn(&mut Image)| {
+        range.copy_from(depth);
+        range.map(|depth| if depth > from && depth <= to { invert(depth, max_depth) } else { 0.0 });
+        dilate(range);
+        image.zip_map(range, |value, dilated| if dilated > EMPTY { dilated } else { value });
     };
-    let over = |below: Image, above: Image| {
-        below.zip_map(&above, |below, above| if above > EMPTY { above } else { below })
-    };
-    let far = over(inverted.clone(), dilate_cross::<3>(&range(middle_end, f32::INFINITY)));
-    let middle = over(far, dilate_cross::<5>(&range(near_end, middle_end)));
-    over(middle, dilate_cross::<7>(&range(EMPTY, near_end)))
+    spread(middle_end, f32::INFINITY, dilate_cross::<3>);
+    spread(near_end, middle_end, dilate_cross::<5>);
+    spread(EMPTY, near_end, dilate_cross::<7>);
 }
 
-/// 1 from the first filled pixel of each column downwards, 0 above it; 1 everywhere in a column that is wholly empty.
-fn below_top(image: &Image) -> Image {
-    let mut empty_column = vec![1.0_f32; image.width()];
+/// Fills the gaps below the highest pixel of each column, first far, then near; leaves in `mask` where that is.
+fn fill_columns(
+    image: &mut Image,
+    mask: &mut Image,
+    filtered: &mut Image,
+    observe: &mut dyn FnMut(&'static str, &Image),
+) {
+    below_top(image, mask);
+    fill::<9>(image, mask, filtered);
+    observe("fill columns", image);
+    below_top(image, mask);
+    observe("top mask", mask);
+    for _ in 0..FILL_ROUNDS {
+        fill::<5>(image, mask, filtered);
+    }
+    observe("fill gaps", image);
+}
+
+/// Smooths the pixels inside `mask` that are filled by now.
+fn smooth(
+    image: &mut Image,
+    mask: &mut Image,
+    filtered: &mut Image,
+    observe: &mut dyn FnMut(&'static str, &Image),
+) {
+    mask.zip_map(image, |inside, value| if value > EMPTY { inside } else { 0.0 });
+    filtered.copy_from(image);
+    median5(filtered);
+    replace(image, mask, filtered);
+    observe("second median", image);
+    filtered.copy_from(image);
+    bilateral5(filtered, SIGMA_VALUE, SIGMA_SPACE);
+    replace(image, mask, filtered);
+    observe("bilateral", image);
+}
+
+/// Writes 1 from the first filled pixel of each column downwards and 0 above it; 1 everywhere in a column that is
+/// wholly empty.
+fn below_top(image: &Image, mask: &mut Image) {
+    let mut below = vec![1.0_f32; image.width()];
     for y in 0..image.height() {
-        for (empty, &value) in empty_column.iter_mut().zip(image.row(y)) {
+        for (empty, &value) in below.iter_mut().zip(image.row(y)) {
             *empty = if value > EMPTY { 0.0 } else { *empty };
         }
     }
-    let mut below = empty_column;
-    image.build_rows(|y, mask| {
-        for ((mask, below), &value) in mask.iter_mut().zip(&mut below).zip(image.row(y)) {
+    mask.rewrite_rows(|_, y, row| {
+        for ((inside, below), &value) in row.iter_mut().zip(&mut below).zip(image.row(y)) {
             *below = if value > EMPTY { 1.0 } else { *below };
-            *mask = *below;
+            *inside = *below;
         }
-    })
+    });
 }
 
 /// Empty pixels inside `mask` take the largest value of the `SIDE x SIDE` square around them.
-fn fill<const SIDE: usize>(image: Image, mask: &Image) -> Image {
-    let around = dilate_full::<SIDE>(&image);
-    let gaps =
-        image.clone().zip_map(mask, |value, inside| if value < EMPTY { inside } else { 0.0 });
-    replace(image, &gaps, &around)
+fn fill<const SIDE: usize>(image: &mut Image, mask: &Image, around: &mut Image) {
+    around.copy_from(image);
+    dilate_full::<SIDE>(around);
+    around.zip_map(mask, |value, inside| value * inside);
+    image.zip_map(
+        around,
+        |value, around| if value < EMPTY && around > 0.0 { around } else { value },
+    );
 }
 
 /// Takes the pixels of `other` where `mask` is 1.
-fn replace(mut image: Image, mask: &Image, other: &Image) -> Image {
+fn replace(image: &mut Image, mask: &Image, other: &Image) {
     let others = mask.values().iter().zip(other.values());
     for (value, (&inside, &other)) in image.values_mut().iter_mut().zip(others) {
         *value = if inside > 0.0 { other } else { *value };
     }
-    image
 }

@@ -139,22 +139,24 @@ fn the_dense_maps_of_a_real_pair() {
 fn the_filters_are_those_of_opencv() {
     let Some(mut golden) = Golden::open("rare/s2_primitives.npz") else { return };
     let input = image(&golden.array("in"));
-    let cases: [(&str, Image, f32); 13] = [
-        ("dilate_FULL_KERNEL_5", dilate_full::<5>(&input), 0.0),
-        ("dilate_FULL_KERNEL_7", dilate_full::<7>(&input), 0.0),
-        ("dilate_FULL_KERNEL_9", dilate_full::<9>(&input), 0.0),
-        ("dilate_CROSS_KERNEL_3", dilate_cross::<3>(&input), 0.0),
-        ("dilate_CROSS_KERNEL_5", dilate_cross::<5>(&input), 0.0),
-        ("dilate_CROSS_KERNEL_7", dilate_cross::<7>(&input), 0.0),
-        ("dilate_DIAMOND_KERNEL_7", dilate_diamond(&input), 0.0),
-        ("close_FULL_KERNEL_5", close_full::<5>(&input), 0.0),
-        ("median5", median5(&input), 0.0),
-        ("bilateral_5_1.5_2", bilateral5(&input, 1.5, 2.0), FAST_BILATERAL),
-        ("bilateral_5_0.5_2", bilateral5(&input, 0.5, 2.0), MULTISCALE_BILATERAL),
-        ("bilateral_5_1.5_2_exact", bilateral5(&input, 1.5, 2.0), ROUNDING),
-        ("bilateral_5_0.5_2_exact", bilateral5(&input, 0.5, 2.0), ROUNDING),
+    let cases: [(&str, fn(&mut Image), f32); 13] = [
+        ("dilate_FULL_KERNEL_5", dilate_full::<5>, 0.0),
+        ("dilate_FULL_KERNEL_7", dilate_full::<7>, 0.0),
+        ("dilate_FULL_KERNEL_9", dilate_full::<9>, 0.0),
+        ("dilate_CROSS_KERNEL_3", dilate_cross::<3>, 0.0),
+        ("dilate_CROSS_KERNEL_5", dilate_cross::<5>, 0.0),
+        ("dilate_CROSS_KERNEL_7", dilate_cross::<7>, 0.0),
+        ("dilate_DIAMOND_KERNEL_7", dilate_diamond, 0.0),
+        ("close_FULL_KERNEL_5", close_full::<5>, 0.0),
+        ("median5", median5, 0.0),
+        ("bilateral_5_1.5_2", |image| bilateral5(image, 1.5, 2.0), FAST_BILATERAL),
+        ("bilateral_5_0.5_2", |image| bilateral5(image, 0.5, 2.0), MULTISCALE_BILATERAL),
+        ("bilateral_5_1.5_2_exact", |image| bilateral5(image, 1.5, 2.0), ROUNDING),
+        ("bilateral_5_0.5_2_exact", |image| bilateral5(image, 0.5, 2.0), ROUNDING),
     ];
-    for (name, image, tolerance) in cases {
+    for (name, filter, tolerance) in cases {
+        let mut image = input.clone();
+        filter(&mut image);
         let share = differing(image.values(), &golden.array(name), tolerance);
         assert_eq!(share, 0.0, "{name}");
     }
