@@ -3,6 +3,7 @@
 
 pub mod data;
 pub mod densify;
+pub mod encode;
 pub mod error;
 pub mod project;
 pub mod random;
