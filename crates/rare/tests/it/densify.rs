@@ -139,7 +139,8 @@ fn the_dense_maps_of_a_real_pair() {
 fn the_filters_are_those_of_opencv() {
     let Some(mut golden) = Golden::open("rare/s2_primitives.npz") else { return };
     let input = image(&golden.array("in"));
-    let cases: [(&str, fn(&mut Image), f32); 13] = [
+    type Filter = fn(&mut Image);
+    let cases: [(&str, Filter, f32); 13] = [
         ("dilate_FULL_KERNEL_5", dilate_full::<5>, 0.0),
         ("dilate_FULL_KERNEL_7", dilate_full::<7>, 0.0),
         ("dilate_FULL_KERNEL_9", dilate_full::<9>, 0.0),
