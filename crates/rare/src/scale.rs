@@ -7,7 +7,7 @@
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
-use crate::data::{DepthRange, PointCloud};
+use crate::data::{DepthRange, PointCloud, voxel_downsample};
 use crate::error::{Error, Result};
 
 /// Which fixed constants to use, or that they are to be found.
@@ -62,14 +62,13 @@ const AZIMUTH_SHARE: f64 = 0.6;
 const VOXEL_BY_RADIUS: f64 = 0.05;
 /// Voxel size by the median range of a surround scan; 30 cm at 15 m, as in KITTI.
 const VOXEL_BY_RANGE: f64 = 0.02;
-/// A voxel is at least this many times the spacing of the points, so that it averages some.
-const VOXEL_BY_SPACING: f64 = 2.0;
+/// Voxels grow while they are more than this share of the points, so that they average some.
+const SPARSE: f64 = 0.9;
 /// The depth that 3DMatch uses, in voxels: 15 m of 5 cm, minus the sentinel that the densifier needs.
 const DEPTH_IN_VOXELS: f64 = 300.0;
 
 impl Scale {
-    /// Fixes all lengths for a pair of clouds. `spacing` is the coarser of the clouds' median point spacings, metres;
-    /// `voxel` overrides the profile's voxel size.
+    /// Fixes all lengths for a pair of clouds. `voxel`, metres, overrides the profile's voxel size.
     ///
     /// # Errors
     /// `InvalidInput` if a given voxel size is not positive, or a cloud has no extent (all points identical).
@@ -91,19 +90,19 @@ impl Scale {
             Profile::Object => SceneKind::Object,
             Profile::Auto => SceneKind::detect(source).common(SceneKind::detect(target)),
         };
-        let automatic = || automatic_voxel(kind, source, target, spacing);
         let voxel = match (voxel, profile) {
             (Some(voxel), _) => voxel,
             (None, Profile::Indoor) => 0.05,
             (None, Profile::Lidar) => 0.3,
-            (None, Profile::Auto | Profile::Object) => automatic(),
+            (None, Profile::Auto | Profile::Object) => automatic_voxel(kind, source, target)?,
         };
-        if voxel <= 0.0 {
-            return Err(Error::invalid(
-                "all points of a cloud are identical: nothing can be registered",
-            ));
-        }
         Ok(Scale::with_voxel(kind, voxel))
+    }
+
+    /// The same lengths in units of `unit` metres.
+    #[must_use]
+    pub fn in_units(&self, unit: f64) -> Scale {
+        Scale::with_voxel(self.kind, self.voxel / unit)
     }
 
     /// All lengths as multiples of a voxel size.
@@ -115,7 +114,7 @@ impl Scale {
             voxel,
             acceptance_radius: 2.0 * voxel,
             common_point_distance: if lidar { voxel * 5.0 / 3.0 } else { voxel },
-            depth_range: DepthRange { minimum: voxel, maximum: DEPTH_IN_VOXELS * voxel },
+            depth_range: DepthRange { min: 0.2 * voxel, max: DEPTH_IN_VOXELS * voxel },
             keypoints: if lidar { 1000 } else { 500 },
         }
     }
@@ -161,16 +160,24 @@ fn azimuth_share(points: &[Point3<f64>]) -> f64 {
     bins.iter().filter(|&&count| count >= enough).count() as f64 / 36.0
 }
 
-/// The smaller cloud decides, the coarser spacing bounds; two significant digits, so that it can be quoted.
-fn automatic_voxel(kind: SceneKind, source: &PointCloud, target: &PointCloud, spacing: f64) -> f64 {
+/// The smaller cloud decides, the sparser one bounds; two significant digits, so that it can be quoted.
+fn automatic_voxel(kind: SceneKind, source: &PointCloud, target: &PointCloud) -> Result<f64> {
     let by_extent = |cloud: &PointCloud| match kind {
         SceneKind::Lidar => VOXEL_BY_RANGE * median_distance(cloud.points(), &Point3::origin()),
         SceneKind::Indoor | SceneKind::Object => {
             VOXEL_BY_RADIUS * median_distance(cloud.points(), &centroid(cloud.points()))
         }
     };
-    let voxel = by_extent(source).min(by_extent(target)).max(VOXEL_BY_SPACING * spacing);
-    two_digits(voxel)
+    let mut voxel = by_extent(source).min(by_extent(target));
+    if voxel <= 0.0 {
+        return Err(Error::invalid("most points of a cloud are identical: give a voxel size"));
+    }
+    for cloud in [source, target] {
+        while voxel_downsample(cloud.points(), voxel)?.len() as f64 > SPARSE * cloud.len() as f64 {
+            voxel *= 1.25;
+        }
+    }
+    Ok(two_digits(voxel))
 }
 
 fn centroid(points: &[Point3<f64>]) -> Point3<f64> {

@@ -5,7 +5,7 @@
 //! camera's own cloud saw, or it stands *in front of* that, in space that was seen to be empty: a free-space
 //! violation. A wrong pose violates free space however many correspondences vote for it; that ranks the candidates.
 
-use nalgebra::{Matrix3x6, Matrix6, Point3, Vector3};
+use nalgebra::{Matrix3x6, Matrix6, Point3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -81,7 +81,7 @@ impl<'a> Verifier<'a> {
         let own_view = |viewpoint: &Viewpoint| {
             let cloud = if viewpoint.frame == Frame::Reference { reference } else { source };
             let viewpoint = shrunk(viewpoint);
-            let own = project_moved(cloud, &viewpoint.camera.camera_from_world, &viewpoint.camera.intrinsics);
+            let own = project_moved(cloud, &viewpoint.camera.camera_from_world, &viewpoint.camera.intrinsics).depth_map;
             OwnView { viewpoint, own }
         };
         Verifier { reference, source, views: viewpoints.par_iter().map(own_view).collect(), tolerance }
@@ -97,7 +97,7 @@ impl<'a> Verifier<'a> {
                     Frame::Reference => (self.source, view.viewpoint.camera_from_source(reference_from_source)),
                     Frame::Source => (self.reference, view.viewpoint.camera_from_reference(reference_from_source)),
                 };
-                let moved = project_moved(cloud, &camera_from_cloud, view.own.intrinsics());
+                let moved = project_moved(cloud, &camera_from_cloud, view.own.intrinsics()).depth_map;
                 compare(&view.own, &moved, self.tolerance)
             })
             .reduce(DepthConsistency::default, |a, b| DepthConsistency {
@@ -154,13 +154,20 @@ pub struct Overlap {
     /// Share of the source points with a reference point within the distance, 0 to 1.
     pub share: f64,
     /// Sum of `G^T G` over those source points moved into the reference frame, `G = [I | -[p]x]`: the 6 x 6 matrix
-    /// of 3DMatch's `gt.info`, translation first. Element (0, 0) is the number of points.
+    /// of 3DMatch's `gt.info`, translation first, metres. Element (0, 0) is the number of points.
     pub information: Matrix6<f64>,
 }
 
-/// Measures the overlap of evenly spaced (voxel) clouds under a pose, with `distance` in metres.
+/// Measures the overlap of evenly spaced (voxel) clouds under a pose, with `distance` in the clouds' unit of `unit`
+/// metres.
 #[must_use]
-pub fn overlap(reference: &KdTree, source: &[Point3<f64>], reference_from_source: &RigidTransform, distance: f64) -> Overlap {
+pub fn overlap(
+    reference: &KdTree,
+    source: &[Point3<f64>],
+    reference_from_source: &RigidTransform,
+    distance: f64,
+    unit: f64,
+) -> Overlap {
     let mut information = Matrix6::zeros();
     let mut count = 0_usize;
     for point in source {
@@ -169,9 +176,44 @@ pub fn overlap(reference: &KdTree, source: &[Point3<f64>], reference_from_source
             count += 1;
             let mut jacobian = Matrix3x6::zeros();
             jacobian.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
-            jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-Vector3::from(moved.coords).cross_matrix()));
+            jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&-(moved.coords * unit).cross_matrix());
             information += jacobian.transpose() * jacobian;
         }
     }
     Overlap { share: count as f64 / source.len().max(1) as f64, information }
+}
+
+/// What to make of a result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// A better transform than the initial one was found and verified.
+    Refined,
+    /// The initial transform stands: nothing better was found.
+    KeptInitial,
+    /// No transform that can be believed; the best guess is given.
+    Rejected,
+}
+
+/// Below this confidence a result is rejected.
+pub const REJECT_BELOW: f64 = 0.5;
+
+impl Verdict {
+    /// The verdict on a pose of some confidence.
+    #[must_use]
+    pub fn of(confidence: f64, is_initial: bool) -> Verdict {
+        match (confidence < REJECT_BELOW, is_initial) {
+            (true, _) => Verdict::Rejected,
+            (false, true) => Verdict::KeptInitial,
+            (false, false) => Verdict::Refined,
+        }
+    }
+}
+
+/// How believable a pose is, 0 to 1: a logistic function of the share of comparable pixels that agree and of the
+/// overlap.
+#[must_use]
+pub fn confidence(consistency: &DepthConsistency, overlap: f64) -> f64 {
+    let evidence = -6.0 + 8.0 * consistency.agreement() + 10.0 * overlap;
+    1.0 / (1.0 + (-evidence).exp())
 }

@@ -76,6 +76,13 @@ impl PointFeatures {
         self.values.get(index * self.dimension..(index + 1) * self.dimension).unwrap_or(&[])
     }
 
+    /// The same features at moved points.
+    #[must_use]
+    pub fn map_points(mut self, move_point: impl Fn(&Point3<f64>) -> Point3<f64>) -> PointFeatures {
+        self.points.iter_mut().for_each(|point| *point = move_point(point));
+        self
+    }
+
     /// The points and features at `indices`, in that order; indices out of range are passed over.
     #[must_use]
     pub fn select(&self, indices: &[usize]) -> PointFeatures {

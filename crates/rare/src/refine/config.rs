@@ -25,6 +25,8 @@ pub struct RefinerConfig {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Recipe {
+    /// Whether depths are taken in metres as the recipe has them, instead of in units that make a voxel 5 cm.
+    pub metric: bool,
     /// How often the clouds are rendered, matched and aligned; the paper does it once.
     pub rounds: usize,
     /// Principal components kept per layer and view; `None` leaves the features as they are. The paper keeps 128.
@@ -61,6 +63,7 @@ impl Default for RefinerConfig {
 impl Default for Recipe {
     fn default() -> Recipe {
         Recipe {
+            metric: false,
             rounds: 3,
             components: Some(64),
             aligned_corners: false,
@@ -79,6 +82,7 @@ impl Recipe {
     #[must_use]
     pub fn paper() -> Recipe {
         Recipe {
+            metric: true,
             rounds: 1,
             components: Some(128),
             aligned_corners: true,
