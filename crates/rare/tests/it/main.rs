@@ -7,5 +7,6 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod sc2_pcr;
 mod shared;
 mod weighted_fit;
