@@ -13,6 +13,7 @@ mod project;
 mod aggregate;
 mod matching;
 mod metrics;
+mod sc2_pcr;
 mod shared;
 mod transfer;
 mod weighted_fit;
