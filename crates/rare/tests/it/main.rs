@@ -7,4 +7,7 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod clouds;
+mod hostile_files;
+mod poses;
 mod shared;
