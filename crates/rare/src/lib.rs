@@ -13,6 +13,7 @@ pub mod fuse;
 pub mod matching;
 pub mod pose;
 pub mod project;
+pub mod io;
 pub mod random;
 pub mod refine;
 pub mod scale;
