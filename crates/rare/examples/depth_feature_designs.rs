@@ -29,7 +29,13 @@ fn transform(value: &Value) -> RigidTransform {
 
 fn designs() -> Vec<(String, DepthFeatures)> {
     let base = DepthFeatures::for_voxel(0.05);
-    vec![("patch".into(), base)]
+    vec![
+        ("default".into(), base.clone()),
+        ("all frequencies".into(), DepthFeatures { frequencies: 18, ..base.clone() }),
+        ("two sizes".into(), DepthFeatures { radii: vec![0.15, 0.35], ..base.clone() }),
+        ("larger sizes".into(), DepthFeatures { radii: vec![0.12, 0.25, 0.5], ..base.clone() }),
+        ("stride 8".into(), DepthFeatures { stride: 8, ..base }),
+    ]
 }
 
 fn main() {
@@ -76,13 +82,13 @@ fn main() {
                 let features = design.encode(&maps).unwrap();
                 let lifted: Vec<PointFeatures> =
                     (0..2).map(|i| lift(&maps[i], &features[i][0])).collect();
-                let matches = rare::matching::mutual_nearest(&lifted[1], &lifted[0]);
+                let matches = rare::matching::mutual_nearest(&lifted[1], &lifted[0], None).unwrap();
                 seconds += start.elapsed().as_secs_f64();
                 let truth_from_view = truth * initial.inverse();
                 let good = matches
                     .iter()
                     .filter(|m| {
-                        (truth_from_view.apply(&lifted[1].points()[m.a]) - lifted[0].points()[m.b])
+                        (truth_from_view.apply(&lifted[1].points()[m.source_index]) - lifted[0].points()[m.target_index])
                             .norm()
                             < 0.1
                     })

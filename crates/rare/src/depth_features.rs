@@ -1,8 +1,10 @@
 //! Built-in depth features: dense descriptors of a depth map that need no weights and no download.
 //!
-//! Around every grid pixel a lattice of fixed *metric* size is laid (its spacing in pixels follows the depth), at two
+//! Around every grid pixel a lattice of fixed *metric* size is laid (its spacing in pixels follows the depth), at three
 //! sizes. At each lattice point stand the depth relative to the centre, clipped to the lattice's size, and the surface
-//! normal in the camera's frame; where nothing was seen both are zero, so holes neither attract nor repel. Both maps
+//! normal in the camera's frame; where nothing was seen both are zero, so holes neither attract nor repel, and so are
+//! the normals of surfaces far before or behind the centre, which parallax moves. The low frequencies of a cosine
+//! transform over the lattice are kept: they carry the similarity of the patches in a quarter of the numbers. Both maps
 //! of a view come from the same virtual camera with a small parallax, which makes upright descriptors fair.
 
 use nalgebra::Vector3;
@@ -11,7 +13,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::data::{DepthMap, FeatureMap, LayeredFeatures};
 use crate::encode::DepthEncoder;
-use crate::error::Result;
+use crate::error::{Error, Result};
+
+/// What stands at one lattice point: weighted relative depth and the normal.
+const CHANNELS: usize = 4;
+/// Surfaces further before or behind the centre than this many lattice radii show no normal.
+const NORMAL_REACH: f32 = 1.5;
+/// The smallest and the largest half baseline of a normal, pixels.
+const BASELINE_PIXELS: (usize, usize) = (2, 16);
 
 /// The settings of the built-in encoder. Lengths are metres.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -22,6 +31,8 @@ pub struct DepthFeatures {
     pub radii: Vec<f64>,
     /// Points along a side of a lattice.
     pub lattice: usize,
+    /// Frequencies kept: those whose indices along the two sides add up to less.
+    pub frequencies: usize,
     /// Weight of the relative depth against the unit normal.
     pub depth_weight: f32,
     /// Half the baseline over which normals are taken, metres.
@@ -29,109 +40,173 @@ pub struct DepthFeatures {
 }
 
 impl DepthFeatures {
-    /// Lattices of 3 and 7 voxels, a cell every 10 pixels: with 5 cm voxels 0.15 m and 0.35 m.
+    /// Lattices of 2, 4 and 8 voxels, a cell every 10 pixels: with 5 cm voxels 0.1 m, 0.2 m and 0.4 m.
     #[must_use]
     pub fn for_voxel(voxel: f64) -> DepthFeatures {
         DepthFeatures {
             stride: 10,
-            radii: vec![3.0 * voxel, 7.0 * voxel],
-            lattice: 7,
+            radii: vec![2.0 * voxel, 4.0 * voxel, 8.0 * voxel],
+            lattice: 9,
+            frequencies: 6,
             depth_weight: 0.7,
-            normal_baseline: 0.3 * voxel,
+            normal_baseline: 0.4 * voxel,
         }
     }
 
     /// Numbers per cell.
     #[must_use]
     pub fn dimension(&self) -> usize {
-        self.radii.len() * self.lattice * self.lattice * 4
+        self.radii.len() * self.coefficients() * CHANNELS
+    }
+
+    /// Coefficients per lattice and channel.
+    fn coefficients(&self) -> usize {
+        let kept = |row: usize| self.frequencies.saturating_sub(row).min(self.lattice);
+        (0..self.frequencies.min(self.lattice)).map(kept).sum()
+    }
+
+    fn validate(&self) -> Result<()> {
+        if self.stride == 0 || self.lattice < 2 || self.frequencies == 0 || self.radii.is_empty() {
+            return Err(Error::invalid(format!("the settings of the built-in depth features make no sense: {self:?}")));
+        }
+        Ok(())
     }
 }
 
 impl DepthEncoder for DepthFeatures {
     fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
-        maps.par_iter().map(|map| Ok(vec![self.describe(map)?])).collect()
+        self.validate()?;
+        let cosines = Cosines::new(self.lattice, self.frequencies);
+        maps.par_iter().map(|map| Ok(vec![self.describe(map, &cosines)?])).collect()
     }
 }
 
 impl DepthFeatures {
     /// One map: `dimension x (height / stride) x (width / stride)`; a cell without depth is all zero.
-    fn describe(&self, map: &DepthMap) -> Result<FeatureMap> {
+    fn describe(&self, map: &DepthMap, cosines: &Cosines) -> Result<FeatureMap> {
         let (rows, columns) = ((map.height() / self.stride).max(1), (map.width() / self.stride).max(1));
-        let normals = NormalMap::new(map, self.normal_baseline);
-        let cells = rows * columns;
-        let mut values = vec![0.0_f32; self.dimension() * cells];
-        let mut descriptor = vec![0.0_f32; self.dimension()];
+        let (cells, dimension) = (rows * columns, self.dimension());
+        let surface = Surface::new(map, self.normal_baseline);
+        let mut values = vec![0.0_f32; dimension * cells];
+        let mut descriptor = vec![0.0_f32; dimension];
+        let mut patch = vec![[0.0_f32; CHANNELS]; self.lattice * self.lattice];
         for cell in 0..cells {
             let u = (cell % columns) * self.stride + self.stride / 2;
             let v = (cell / columns) * self.stride + self.stride / 2;
-            if map.at(u, v) > 0.0 {
-                self.describe_pixel(map, &normals, u, v, &mut descriptor);
-                for (channel, &value) in descriptor.iter().enumerate() {
-                    values[channel * cells + cell] = value;
-                }
+            if map.at(u, v) <= 0.0 {
+                continue;
+            }
+            for (&radius, out) in self.radii.iter().zip(descriptor.chunks_exact_mut(dimension / self.radii.len())) {
+                self.sample_patch(&surface, (u, v), radius as f32, &mut patch);
+                cosines.transform(&patch, out);
+            }
+            let norm = descriptor.iter().map(|value| value * value).sum::<f32>().sqrt() + 1e-6;
+            for (channel, value) in descriptor.iter().enumerate() {
+                values[channel * cells + cell] = value / norm;
             }
         }
-        FeatureMap::new(self.dimension(), rows, columns, values)
+        FeatureMap::new(dimension, rows, columns, values)
     }
 
-    fn describe_pixel(&self, map: &DepthMap, normals: &NormalMap, u: usize, v: usize, descriptor: &mut [f32]) {
-        let depth = map.at(u, v);
-        let focal = map.intrinsics().fx as f32;
-        let half = (self.lattice.max(2) - 1) as f32 / 2.0;
-        let mut out = descriptor.chunks_exact_mut(4);
-        for &radius in &self.radii {
-            let radius = radius as f32;
-            let step = radius * focal / depth / half;
-            for row in 0..self.lattice {
-                for column in 0..self.lattice {
-                    let x = u as f32 + (column as f32 - half) * step;
-                    let y = v as f32 + (row as f32 - half) * step;
-                    if let Some(out) = out.next() {
-                        out.copy_from_slice(&self.sample(map, normals, (x, y), depth, radius));
-                    }
-                }
+    /// The lattice of half side `radius` around a pixel, row by row; clamped to the image.
+    fn sample_patch(&self, surface: &Surface<'_>, (u, v): (usize, usize), radius: f32, patch: &mut [[f32; CHANNELS]]) {
+        let map = surface.map;
+        let centre = map.at(u, v);
+        let half = (self.lattice - 1) as f32 / 2.0;
+        let step = radius * map.intrinsics().fx as f32 / centre / half;
+        for (row, points) in patch.chunks_exact_mut(self.lattice).enumerate() {
+            let y = nearest_pixel(v as f32 + (row as f32 - half) * step, map.height());
+            for (column, point) in points.iter_mut().enumerate() {
+                let x = nearest_pixel(u as f32 + (column as f32 - half) * step, map.width());
+                *point = self.sample(surface, y * map.width() + x, centre, radius);
             }
         }
-        let norm = descriptor.iter().map(|value| value * value).sum::<f32>().sqrt() + 1e-6;
-        descriptor.iter_mut().for_each(|value| *value /= norm);
     }
 
-    /// Relative depth and normal at real-valued pixel coordinates, clamped to the image.
-    fn sample(&self, map: &DepthMap, normals: &NormalMap, (x, y): (f32, f32), centre: f32, radius: f32) -> [f32; 4] {
-        let u = (x.round().max(0.0) as usize).min(map.width() - 1);
-        let v = (y.round().max(0.0) as usize).min(map.height() - 1);
-        let depth = map.at(u, v);
+    fn sample(&self, surface: &Surface<'_>, pixel: usize, centre: f32, radius: f32) -> [f32; CHANNELS] {
+        let depth = surface.map.depth()[pixel];
         if depth <= 0.0 {
-            return [0.0; 4];
+            return [0.0; CHANNELS];
         }
-        let relative = ((depth - centre) / radius).clamp(-1.0, 1.0);
-        let normal = normals.normals[v * map.width() + u];
-        [relative * self.depth_weight, normal[0], normal[1], normal[2]]
+        let relative = (depth - centre) / radius;
+        let [x, y, z] = if relative.abs() > NORMAL_REACH { [0.0; 3] } else { surface.normals[pixel] };
+        [relative.clamp(-1.0, 1.0) * self.depth_weight, x, y, z]
     }
 }
 
-/// Unit normals of a depth map in the camera's frame; zero where a neighbour is missing.
-struct NormalMap {
+fn nearest_pixel(position: f32, size: usize) -> usize {
+    (position.round().max(0.0) as usize).min(size - 1)
+}
+
+/// The low frequencies of the orthonormal cosine transform (DCT-II) along one side of a lattice.
+struct Cosines {
+    lattice: usize,
+    /// `frequencies x lattice`.
+    basis: Vec<f32>,
+}
+
+impl Cosines {
+    fn new(lattice: usize, frequencies: usize) -> Cosines {
+        let n = lattice as f64;
+        let value = |frequency: usize, position: usize| {
+            let scale = if frequency == 0 { (1.0 / n).sqrt() } else { (2.0 / n).sqrt() };
+            (scale * (std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n).cos()) as f32
+        };
+        let frequencies = frequencies.min(lattice);
+        let basis = (0..frequencies).flat_map(|k| (0..lattice).map(move |i| value(k, i))).collect();
+        Cosines { lattice, basis }
+    }
+
+    /// Transforms a lattice of points; coefficients whose indices add up to less than the number of frequencies, each
+    /// with all channels.
+    fn transform(&self, patch: &[[f32; CHANNELS]], out: &mut [f32]) {
+        let frequencies = self.basis.len() / self.lattice;
+        let mut columns = vec![[0.0; CHANNELS]; self.lattice];
+        let mut out = out.chunks_exact_mut(CHANNELS);
+        for (down, basis_down) in self.basis.chunks_exact(self.lattice).enumerate() {
+            for (column, sum) in columns.iter_mut().enumerate() {
+                *sum = weighted_sum(basis_down, patch.iter().skip(column).step_by(self.lattice));
+            }
+            for basis_across in self.basis.chunks_exact(self.lattice).take(frequencies - down) {
+                if let Some(out) = out.next() {
+                    out.copy_from_slice(&weighted_sum(basis_across, columns.iter()));
+                }
+            }
+        }
+    }
+}
+
+fn weighted_sum<'a>(weights: &[f32], points: impl Iterator<Item = &'a [f32; CHANNELS]>) -> [f32; CHANNELS] {
+    let mut sum = [0.0; CHANNELS];
+    for (weight, point) in weights.iter().zip(points) {
+        for (sum, value) in sum.iter_mut().zip(point) {
+            *sum += weight * value;
+        }
+    }
+    sum
+}
+
+/// A depth map with unit normals in the camera's frame; zero where a neighbour is missing.
+struct Surface<'a> {
+    map: &'a DepthMap,
     normals: Vec<[f32; 3]>,
 }
 
-impl NormalMap {
-    fn new(map: &DepthMap, baseline: f64) -> NormalMap {
-        let (width, height) = (map.width(), map.height());
-        let normals = (0..width * height)
-            .map(|index| normal_at(map, index % width, index / width, baseline).unwrap_or([0.0; 3]))
-            .collect();
-        NormalMap { normals }
+impl<'a> Surface<'a> {
+    fn new(map: &'a DepthMap, baseline: f64) -> Surface<'a> {
+        let width = map.width();
+        let normal = |pixel| normal_at(map, pixel % width, pixel / width, baseline).unwrap_or([0.0; 3]);
+        Surface { map, normals: (0..map.depth().len()).map(normal).collect() }
     }
 }
 
-/// The normal from the four neighbours at a fixed metric distance (at least 2 pixels).
+/// The normal from the four neighbours at a fixed metric distance.
 fn normal_at(map: &DepthMap, u: usize, v: usize, baseline: f64) -> Option<[f32; 3]> {
     let intrinsics = map.intrinsics();
     let seen = |u: usize, v: usize| Some(map.at(u, v)).filter(|&depth| depth > 0.0);
     let centre = seen(u, v)?;
-    let step = ((baseline * intrinsics.fx / f64::from(centre)) as usize).clamp(2, 16);
+    let pixels = (baseline * intrinsics.fx / f64::from(centre)) as usize;
+    let step = pixels.clamp(BASELINE_PIXELS.0, BASELINE_PIXELS.1);
     let point = |u: usize, v: usize| {
         let depth = seen(u, v)?;
         let x = (u as f32 - intrinsics.cx as f32) / intrinsics.fx as f32;

@@ -8,13 +8,13 @@ pub mod depth_features;
 pub mod encode;
 pub mod error;
 pub mod features;
-pub mod io;
 pub mod fuse;
+pub mod io;
 pub mod matching;
 pub mod pose;
 pub mod project;
-pub mod io;
 pub mod random;
+pub mod reduce;
 pub mod refine;
 pub mod scale;
 pub mod transfer;
@@ -23,7 +23,8 @@ pub mod viewpoints;
 
 pub use data::{
     Camera, Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap,
-    Intrinsics, PointCloud, PointFeatures, RigidTransform, SetName,
+    Intrinsics, PointCloud, PointFeatures, RigidTransform, Scan, SetName,
 };
 pub use error::{Error, Result};
 pub use nalgebra;
+pub use refine::{Recipe, Refinement, Refiner, RefinerConfig};

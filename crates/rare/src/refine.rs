@@ -24,7 +24,7 @@ use crate::encode::DepthEncoder;
 use crate::error::Result;
 use crate::scale::{Scale, SceneKind};
 use crate::transfer::Sampling;
-use crate::verify::{DepthConsistency, Verdict, Verifier, confidence, overlap};
+use crate::verify::{DepthConsistency, Verdict, Verifier, confidence};
 use crate::viewpoints::{self, Viewpoint};
 
 /// Refines initial transforms between clouds.

@@ -77,7 +77,6 @@ impl Scale {
         voxel: Option<f64>,
         source: &PointCloud,
         target: &PointCloud,
-        spacing: f64,
     ) -> Result<Scale> {
         if let Some(voxel) = voxel.filter(|voxel| !(voxel.is_finite() && *voxel > 0.0)) {
             return Err(Error::invalid(format!(

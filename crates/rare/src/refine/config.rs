@@ -65,7 +65,7 @@ impl Default for Recipe {
         Recipe {
             metric: false,
             rounds: 3,
-            components: Some(64),
+            components: None,
             aligned_corners: false,
             consensus: true,
             keep_initial: true,

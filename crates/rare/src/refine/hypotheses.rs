@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::aggregate::{Aggregation, aggregate, aggregate_candidates};
 use crate::data::{Correspondence, CorrespondenceSets, RigidTransform};
 use crate::error::Result;
-use crate::pose::{Icp, Sc2Pcr};
+use crate::pose::{Icp, IcpStage, RobustKernel, Sc2Pcr};
 use crate::refine::Recipe;
 use crate::refine::working_pair::WorkingPair;
 use crate::scale::Scale;
@@ -47,11 +47,10 @@ pub(super) fn propose(recipe: &Recipe, scale: &Scale, sets: &CorrespondenceSets)
     if !recipe.consensus {
         return Ok(vec![aggregate(sets, &config, None)?.consensus.target_from_source]);
     }
-    let mut union = sets.union();
-    let candidates = by_consensus(scale, sets);
-    let aggregated = aggregate_candidates(&union, &candidates, &config)?.target_from_source_as_vec();
-    keep_best_scored(&mut union, MOST_PAIRS);
-    Ok(aggregated.into_iter().chain(candidates).collect())
+    let mut candidates = by_consensus(scale, sets);
+    let consensus = aggregate_candidates(&sets.union(), &candidates, &config)?;
+    candidates.insert(0, consensus.target_from_source);
+    Ok(candidates)
 }
 
 /// Consensus inside each set: a set with many wrong pairs still has right ones, which one fit over all would drown.
@@ -81,14 +80,25 @@ pub(super) fn rank(proposed: &[RigidTransform], current: &Candidate, verifier: &
 
 /// The best candidates moved onto the surface; of those and the unpolished ones, the most consistent.
 pub(super) fn polish(pair: &WorkingPair<'_>, ranked: &[Candidate], verifier: &Verifier<'_>) -> Candidate {
-    let icp = Icp::for_voxel(pair.scale.voxel / 2.0);
-    let polished = ranked.iter().take(POLISHED).filter_map(|candidate| {
-        let aligned =
-            icp.align(pair.source.surface.points(), &pair.target.surface, &candidate.target_from_source).ok()?;
+    let icp = polish_schedule(pair.scale.voxel);
+    let polished = ranked.par_iter().take(POLISHED).filter_map(|candidate| {
+        let aligned = icp.align(&pair.source.coarse, &pair.target.surface, &candidate.target_from_source).ok()?;
         Some(Candidate::judged(aligned.target_from_source, verifier))
     });
     let mut all: Vec<Candidate> = polished.collect();
     all.extend(ranked.first());
     all.sort_by(|a, b| b.consistency.score().total_cmp(&a.consistency.score()));
     all[0]
+}
+
+/// Tukey point-to-plane within three voxels, then one and a half: 15 cm and 7.5 cm indoors.
+fn polish_schedule(voxel: f64) -> Icp {
+    let stage = |voxels: f64| IcpStage { max_distance: voxels * voxel, kernel_width: voxels * voxel };
+    Icp {
+        kernel: RobustKernel::Tukey,
+        stages: vec![stage(3.0), stage(1.5)],
+        max_iterations: 15,
+        rotation_tolerance: 5e-4,
+        translation_tolerance: 0.01 * voxel,
+    }
 }

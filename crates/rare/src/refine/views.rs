@@ -2,7 +2,6 @@
 
 use rayon::prelude::*;
 
-use crate::aggregate;
 use crate::data::{
     Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap, LayeredFeatures,
     PointFeatures, RigidTransform, SetName,
@@ -10,10 +9,9 @@ use crate::data::{
 use crate::densify::Densifier;
 use crate::error::{Error, Result};
 use crate::fuse::fuse;
-use crate::matching::{self, correspondences, mutual_nearest};
+use crate::matching::{correspondences, mutual_nearest};
 use crate::project::project_moved;
 use crate::reduce::reduce;
-use crate::refine::Recipe;
 use crate::refine::working_pair::WorkingPair;
 use crate::transfer::{Sampling, common_points, lift};
 use crate::viewpoints::{Frame, Viewpoint};
@@ -31,18 +29,13 @@ pub(super) fn project_all(
     viewpoints: &[Viewpoint],
     pose: &RigidTransform,
 ) -> Vec<DepthMap> {
-    let sides = viewpoints.iter().flat_map(|view| {
-        [
-            (&pair.target.points, view.camera_from_reference(pose), view),
-            (&pair.source.points, view.camera_from_source(pose), view),
-        ]
-    });
-    let sides: Vec<_> = sides.collect();
-    let see = |(points, camera_from_points, view): &(_, RigidTransform, &Viewpoint)| {
-        let points: &std::borrow::Cow<'_, [_]> = points;
-        project_moved(points, camera_from_points, &view.camera.intrinsics).depth_map
+    let see = |view: &Viewpoint| {
+        let camera = &view.camera.intrinsics;
+        let reference = project_moved(&pair.target.points, &view.camera_from_reference(pose), camera);
+        let source = project_moved(&pair.source.points, &view.camera_from_source(pose), camera);
+        [reference.depth_map, source.depth_map]
     };
-    sides.par_iter().map(see).collect()
+    viewpoints.par_iter().flat_map_iter(see).collect()
 }
 
 /// Step 2: the gaps between the points of every map closed.
@@ -76,12 +69,11 @@ pub(super) fn transfer_all(
     sampling: Sampling,
 ) -> Vec<Both<PointFeatures>> {
     let (maps, _) = maps.as_chunks::<2>();
-    let lifted = |((view, [reference, source]), features): ((&Viewpoint, &[DepthMap; 2]), &Both<FeatureMap>)| {
+    let lift_view = |view: &Viewpoint, [reference, source]: &[DepthMap; 2], features: &Both<FeatureMap>| {
         let in_own_frame = |features, map, camera_from_cloud: RigidTransform| {
             let cloud_from_camera = camera_from_cloud.inverse();
-            lift(features, map, pair.scale.depth_range, sampling)
-                .keypoints
-                .map_points(|point| cloud_from_camera.apply(point))
+            let lifted = lift(features, map, pair.scale.depth_range, sampling).keypoints;
+            lifted.map_points(|point| cloud_from_camera.apply(point))
         };
         Both {
             reference: in_own_frame(&features.reference, reference, view.camera_from_reference(pose)),
@@ -89,7 +81,7 @@ pub(super) fn transfer_all(
         }
     };
     let views: Vec<_> = viewpoints.iter().zip(maps).zip(features).collect();
-    views.into_par_iter().map(lifted).collect()
+    views.into_par_iter().map(|((view, maps), features)| lift_view(view, maps, features)).collect()
 }
 
 /// Step 6: the common points of every view with fused features.

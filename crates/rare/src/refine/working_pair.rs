@@ -118,7 +118,7 @@ impl<'a> WorkingCloud<'a> {
         let mut random = Random::new(config.seed, stream);
         let keypoints = match &scan.features {
             Some(features) => sampled(features, scan.cloud.shift(), unit, count, &mut random),
-            None => histograms(&coarse, scale, count, &mut random),
+            None => histograms(&coarse, scale, count, &mut random)?,
         };
         Ok(WorkingCloud { points, coarse, surface, keypoints })
     }
@@ -145,7 +145,7 @@ fn sampled(features: &PointFeatures, shift: &Vector3<f64>, unit: f64, count: usi
 
 /// Fast point feature histograms at `count` random voxel points: normals from 30 neighbours within 2 voxels, features
 /// from 100 neighbours within 5, as the official evaluations have it.
-fn histograms(coarse: &[Point3<f64>], scale: &Scale, count: usize, random: &mut Random) -> PointFeatures {
+fn histograms(coarse: &[Point3<f64>], scale: &Scale, count: usize, random: &mut Random) -> Result<PointFeatures> {
     let tree = KdTree::new(coarse);
     let mut normals = estimate_normals(coarse, &tree, 2.0 * scale.voxel, 30);
     if scale.kind != SceneKind::Object {
