@@ -7,6 +7,9 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod fpfh;
+mod ransac;
 mod sc2_pcr;
 mod shared;
+mod synthetic_pairs;
 mod weighted_fit;
