@@ -4,6 +4,7 @@ mod consensus;
 mod consistency;
 mod icp;
 mod normal_equations;
+mod ransac;
 mod rigid_fit;
 mod robust_kernel;
 mod sc2_pcr;
@@ -11,6 +12,7 @@ mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
 pub use icp::{Icp, IcpResult, IcpStage, IcpTarget};
+pub use ransac::Ransac;
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
 pub use sc2_pcr::{Sc2Pcr, Sc2PcrMode, Sc2PcrSeeds};

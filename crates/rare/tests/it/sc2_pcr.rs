@@ -1,11 +1,11 @@
 //! SC2-PCR against the released implementation, and on synthetic correspondences.
 
-use nalgebra::{Point3, Rotation3, Vector3};
-use rare::pose::{PoseEstimator, Sc2Pcr, Sc2PcrMode};
-use rare::random::Random;
-use rare::{Correspondence, PointCloud, RigidTransform};
+use nalgebra::Vector3;
+use rare::pose::{Sc2Pcr, Sc2PcrMode};
+use rare::{Correspondence, RigidTransform};
 
 use crate::shared::Golden;
+use crate::synthetic_pairs::{estimate, motion, synthetic};
 
 /// 1000 nearest-neighbour FPFH matches of a real indoor pair, and the true pose.
 fn real_matches() -> Option<(Vec<Correspondence>, RigidTransform)> {
@@ -16,16 +16,6 @@ fn real_matches() -> Option<(Vec<Correspondence>, RigidTransform)> {
         .collect();
     let truth = RigidTransform::from_matrix(&golden.array("gt").matrix4()).unwrap();
     Some((pairs, truth))
-}
-
-fn cloud_of(points: impl Iterator<Item = Point3<f64>>) -> PointCloud {
-    PointCloud::new(points.collect()).unwrap()
-}
-
-fn estimate(settings: &Sc2Pcr, pairs: &[Correspondence]) -> rare::pose::PoseEstimate {
-    let source = cloud_of(pairs.iter().map(|pair| pair.source));
-    let target = cloud_of(pairs.iter().map(|pair| pair.target));
-    settings.estimate(&source, &target, pairs).unwrap()
 }
 
 #[test]
@@ -63,25 +53,6 @@ fn confidences_seeds_and_pose_agree_with_the_released_code() {
         let difference = (ours - golden.array(name).matrix4()).abs().max();
         assert!(difference < tolerance, "{name} differs by {difference}");
     }
-}
-
-/// `count` pairs of which `share` follow `truth` up to 1 cm of noise; the rest joins random points.
-fn synthetic(count: usize, share: f64, truth: &RigidTransform, seed: u64) -> Vec<Correspondence> {
-    let mut random = Random::new(seed, 0);
-    let mut pair = |i: usize| {
-        let mut somewhere =
-            || Point3::new(4.0 * random.uniform(), 3.0 * random.uniform(), 2.5 * random.uniform());
-        let (source, elsewhere) = (somewhere(), somewhere());
-        let noise = Vector3::new(random.normal(), random.normal(), random.normal()) * 0.01;
-        let is_inlier = (i as f64) < share * count as f64;
-        let target = truth.apply(if is_inlier { &source } else { &elsewhere }) + noise;
-        Correspondence { source, target, score: 1.0 }
-    };
-    (0..count).map(&mut pair).collect()
-}
-
-fn motion() -> RigidTransform {
-    RigidTransform::new(Rotation3::new(Vector3::new(1.5, -0.7, 0.4)), Vector3::new(3.0, -2.0, 1.0))
 }
 
 #[test]
