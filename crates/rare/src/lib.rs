@@ -7,6 +7,7 @@ pub mod encode;
 pub mod error;
 pub mod project;
 pub mod random;
+pub mod reduce;
 
 pub use data::{
     Camera, Correspondence, DepthMap, FeatureMap, Intrinsics, PointCloud, PointFeatures,

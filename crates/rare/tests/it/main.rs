@@ -9,4 +9,5 @@
 
 mod densify;
 mod project;
+mod reduce;
 mod shared;

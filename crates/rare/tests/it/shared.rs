@@ -83,20 +83,21 @@ impl Golden {
             .expect("a golden file reads")
             .unwrap_or_else(|| panic!("{}: no array {name}", self.path.display()));
         let shape = npy.shape().iter().map(|&size| size as usize).collect();
-        assert_eq!(npy.order(), npyz::Order::C);
+        let order = npy.order();
         let npyz::DType::Plain(kind) = npy.dtype() else { panic!("{name}: structured array") };
         let values = match kind.to_string().as_str() {
             "<f4" => npy.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
             "<f8" => npy.into_vec::<f64>().unwrap(),
             "<i4" => npy.into_vec::<i32>().unwrap().into_iter().map(f64::from).collect(),
-            "<i8" => {
-                npy.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect()
-            }
+            "<i8" => npy.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect(),
             "|u1" => npy.into_vec::<u8>().unwrap().into_iter().map(f64::from).collect(),
             "|b1" => npy.into_vec::<bool>().unwrap().into_iter().map(f64::from).collect(),
             other => panic!("{name}: number type {other}"),
         };
-        Array { shape, values }
+        match order {
+            npyz::Order::C => Array { shape, values },
+            npyz::Order::Fortran => Array { values: transposed(&shape, &values), shape },
+        }
     }
 
     /// The names of all arrays, sorted.
@@ -105,6 +106,12 @@ impl Golden {
         names.sort();
         names
     }
+}
+
+/// The values of a two-dimensional array in Fortran order, in C order.
+fn transposed(shape: &[usize], values: &[f64]) -> Vec<f64> {
+    let [rows, columns] = *shape else { panic!("an array in Fortran order with shape {shape:?}") };
+    (0..rows * columns).map(|at| values[at % columns * rows + at / columns]).collect()
 }
 
 #[test]
