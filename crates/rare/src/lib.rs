@@ -5,6 +5,7 @@ pub mod data;
 pub mod densify;
 pub mod encode;
 pub mod error;
+pub mod hint;
 pub mod project;
 pub mod random;
 pub mod reduce;

@@ -8,6 +8,7 @@
 )]
 
 mod densify;
+mod hint;
 mod project;
 mod reduce;
 mod shared;
