@@ -20,6 +20,10 @@ pub mod scale;
 pub mod transfer;
 pub mod verify;
 pub mod viewpoints;
+pub mod hint;
+pub mod project;
+pub mod random;
+pub mod reduce;
 
 pub use data::{
     Camera, Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap,
