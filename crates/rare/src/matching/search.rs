@@ -16,8 +16,11 @@ use crate::data::PointFeatures;
 pub(super) const TILE_ROWS: usize = 256;
 /// Target rows of one tile: 256 x 512 products are 512 KiB and stay in the second-level cache.
 pub(super) const TILE_COLUMNS: usize = 512;
-/// Independent running maxima, so that the compiler can keep them in vector registers.
+/// Columns that are compared at a time, so that the compiler keeps their maxima in vector registers. Tiles are padded
+/// to a multiple of it.
 const LANES: usize = 16;
+/// Rows of which the highest is found before a column's best is looked at.
+const ROW_GROUP: usize = 8;
 /// No candidate so far.
 const NONE: u32 = u32::MAX;
 
@@ -36,7 +39,8 @@ pub(super) fn search(
     locality: Option<&Locality<'_>>,
     both_directions: bool,
 ) -> Nearest {
-    let columns = if both_directions { target.len() } else { 0 };
+    let targets = target.len();
+    let columns = if both_directions { targets.next_multiple_of(LANES) } else { 0 };
     let search = Search {
         source: Side::new(source),
         target: Side::new(target),
@@ -55,13 +59,17 @@ pub(super) fn search(
         })
         .reduce_with(Best::merge)
         .unwrap_or_else(|| Best::new(columns));
-    Nearest { of_source: rows.indices(), of_target: best_columns.indices() }
+    let mut of_target = best_columns.indices();
+    of_target.truncate(targets);
+    Nearest { of_source: rows.indices(), of_target }
 }
 
-/// The features of one side, and half of their squared norms.
+/// The features of one side.
 struct Side<'a> {
     values: &'a [f32],
     dimension: usize,
+    len: usize,
+    /// Half of each squared norm, filled up to a multiple of [`LANES`] with what is infinitely far away.
     half_squared_norms: Vec<f32>,
 }
 
@@ -70,20 +78,21 @@ impl<'a> Side<'a> {
         let squared_norm = |row: &[f32]| row.iter().map(|&x| f64::from(x).powi(2)).sum::<f64>();
         let (values, dimension) = (features.values(), features.dimension().max(1));
         let half = |row| (squared_norm(row) / 2.0) as f32;
-        Side {
-            values,
-            dimension,
-            half_squared_norms: values.chunks_exact(dimension).map(half).collect(),
-        }
+        let mut half_squared_norms: Vec<f32> = values.chunks_exact(dimension).map(half).collect();
+        let len = half_squared_norms.len();
+        half_squared_norms.resize(len.next_multiple_of(LANES), f32::INFINITY);
+        Side { values, dimension, len, half_squared_norms }
     }
 
-    /// The rows from `first` on, at most `count`: their features and half squared norms.
-    fn rows(&self, first: usize, count: usize) -> (&[f32], &[f32]) {
-        let end = self.half_squared_norms.len().min(first + count);
-        (
-            &self.values[first * self.dimension..end * self.dimension],
-            &self.half_squared_norms[first..end],
-        )
+    /// The features of the rows from `first` on, at most `count`.
+    fn features(&self, first: usize, count: usize) -> &[f32] {
+        let end = self.len.min(first + count);
+        &self.values[first * self.dimension..end * self.dimension]
+    }
+
+    /// The half squared norms of the same rows and of what fills them up; `count` is a multiple of [`LANES`].
+    fn half_squared_norms(&self, first: usize, count: usize) -> &[f32] {
+        &self.half_squared_norms[first..self.half_squared_norms.len().min(first + count)]
     }
 }
 
@@ -132,46 +141,57 @@ impl Search<'_> {
         columns: &mut Best,
     ) {
         let first = block * TILE_ROWS;
-        let (source, source_norms) = self.source.rows(first, TILE_ROWS);
-        let targets = self.target.half_squared_norms.len();
-        let mut tile = vec![0.0; source_norms.len() * TILE_COLUMNS.min(targets)];
-        for from in (0..targets).step_by(TILE_COLUMNS) {
+        let source_norms = self.source.half_squared_norms(first, TILE_ROWS);
+        let widest = TILE_COLUMNS.min(self.target.half_squared_norms.len());
+        let mut tile = vec![0.0; row_index.len() * widest];
+        for from in (0..self.target.len).step_by(TILE_COLUMNS) {
             if self.window.as_ref().is_some_and(|window| window.excludes(first, from)) {
                 continue;
             }
-            let (target, target_norms) = self.target.rows(from, TILE_COLUMNS);
-            let products = &mut tile[..source_norms.len() * target_norms.len()];
-            multiply(source, target, self.source.dimension, products);
-            if let Some(window) = &self.window {
-                window.mask(first, from, target_norms.len(), products);
-            }
+            let target_norms = self.target.half_squared_norms(from, TILE_COLUMNS);
+            let width = target_norms.len();
+            let products = &mut tile[..row_index.len() * width];
+            self.fill(first, from, width, products);
             let rows = row_score.iter_mut().zip(row_index.iter_mut());
-            for ((score, index), row) in rows.zip(products.chunks_exact(target_norms.len())) {
+            for ((score, index), row) in rows.zip(products.chunks_exact(width)) {
                 best_of_row(row, target_norms, from, score, index);
             }
-            best_of_columns(
-                products,
-                source_norms,
-                first,
-                from..from + target_norms.len(),
-                columns,
-            );
+            let range = from..from + width;
+            let scores = columns.score.get_mut(range.clone());
+            if let (Some(scores), Some(indices)) = (scores, columns.index.get_mut(range)) {
+                best_of_columns(products, source_norms, first, scores, indices);
+            }
+        }
+    }
+
+    /// The products of the tile at source row `first` and target row `from`. Its rows are `width` apart; what fills
+    /// them up beyond the last target is left as it is, because nothing that is taken from it is kept.
+    fn fill(&self, first: usize, from: usize, width: usize, products: &mut [f32]) {
+        let dimension = self.source.dimension;
+        let source = self.source.features(first, TILE_ROWS);
+        let target = self.target.features(from, TILE_COLUMNS);
+        let (rows, columns) = (source.len() / dimension, target.len() / dimension);
+        // Seen column-major, the row-major product is its transpose: target times transposed source.
+        matmul(
+            MatMut::from_column_major_slice_with_stride_mut(products, columns, rows, width),
+            Accum::Replace,
+            MatRef::from_row_major_slice(target, columns, dimension),
+            MatRef::from_column_major_slice(source, dimension, rows),
+            1.0,
+            Par::Seq,
+        );
+        if let Some(window) = &self.window {
+            window.mask(first, from, columns, width, products);
         }
     }
 }
 
-/// `products` (source rows x target rows, row-major) = source features times target features, transposed.
-fn multiply(source: &[f32], target: &[f32], dimension: usize, products: &mut [f32]) {
-    let (rows, columns) = (source.len() / dimension, target.len() / dimension);
-    // Seen column-major, the row-major product is its transpose: target times transposed source.
-    matmul(
-        MatMut::from_column_major_slice_mut(products, columns, rows),
-        Accum::Replace,
-        MatRef::from_row_major_slice(target, columns, dimension),
-        MatRef::from_column_major_slice(source, dimension, rows),
-        1.0,
-        Par::Seq,
-    );
+/// The maximum of both, lane by lane, where NaN never wins.
+fn highest(lanes: &mut [f32; LANES], products: &[f32; LANES], half_norm: impl Fn(usize) -> f32) {
+    for lane in 0..LANES {
+        let candidate = products[lane] - half_norm(lane);
+        lanes[lane] = if candidate > lanes[lane] { candidate } else { lanes[lane] };
+    }
 }
 
 /// Takes the columns of one row, which start at column `from`, into the row's running best.
@@ -182,44 +202,53 @@ fn best_of_row(
     score: &mut f32,
     index: &mut u32,
 ) {
-    let (product_lanes, product_rest) = products.as_chunks::<LANES>();
-    let (norm_lanes, norm_rest) = half_norms.as_chunks::<LANES>();
-    let mut best = [f32::NEG_INFINITY; LANES];
-    for (product, norm) in product_lanes.iter().zip(norm_lanes) {
-        for lane in 0..LANES {
-            let candidate = product[lane] - norm[lane];
-            best[lane] = if candidate > best[lane] { candidate } else { best[lane] };
-        }
+    let mut lanes = [f32::NEG_INFINITY; LANES];
+    let (product_lanes, _) = products.as_chunks::<LANES>();
+    let (norm_lanes, _) = half_norms.as_chunks::<LANES>();
+    for (products, norms) in product_lanes.iter().zip(norm_lanes) {
+        highest(&mut lanes, products, |lane| norms[lane]);
     }
-    let rest = product_rest.iter().zip(norm_rest).map(|(product, norm)| product - norm);
-    let highest = best.into_iter().chain(rest).fold(f32::NEG_INFINITY, f32::max);
-    if highest > *score {
+    let best = lanes.into_iter().fold(f32::NEG_INFINITY, f32::max);
+    if best > *score {
         let mut candidates = products.iter().zip(half_norms);
-        if let Some(column) = candidates.position(|(product, norm)| product - norm == highest) {
-            (*score, *index) = (highest, (from + column) as u32);
+        if let Some(column) = candidates.position(|(product, norm)| product - norm == best) {
+            (*score, *index) = (best, (from + column) as u32);
         }
     }
 }
 
-/// Takes the rows of one tile, which start at row `first`, into the running best of its columns, if that is asked for.
+/// The best of each column of a tile whose rows start at row `first`. `scores` and `indices` are those of
+/// [`Best::new`]: a block of rows meets every column once.
 fn best_of_columns(
     products: &[f32],
     half_norms: &[f32],
     first: usize,
-    range: std::ops::Range<usize>,
-    columns: &mut Best,
+    scores: &mut [f32],
+    indices: &mut [u32],
 ) {
-    let Some(scores) = columns.score.get_mut(range.clone()) else { return };
-    let Some(indices) = columns.index.get_mut(range) else { return };
-    let rows = products.chunks_exact(scores.len()).zip(half_norms);
-    for (row, (products, half_norm)) in rows.enumerate() {
-        let row = (first + row) as u32;
-        for ((product, score), index) in products.iter().zip(&mut *scores).zip(&mut *indices) {
-            // Two selects, not a branch, so that the loop becomes vector code.
-            let candidate = product - half_norm;
-            let better = candidate > *score;
-            *score = if better { candidate } else { *score };
-            *index = if better { row } else { *index };
+    let width = scores.len();
+    let (score_lanes, _) = scores.as_chunks_mut::<LANES>();
+    let (index_lanes, _) = indices.as_chunks_mut::<LANES>();
+    let groups = || products.chunks(ROW_GROUP * width).zip(half_norms.chunks(ROW_GROUP));
+    // First only which group of rows has the best: one comparison in eight needs to carry an index.
+    for ((products, half_norms), group) in groups().zip(0_u32..) {
+        for (run, (score, index)) in score_lanes.iter_mut().zip(&mut *index_lanes).enumerate() {
+            let mut lanes = [f32::NEG_INFINITY; LANES];
+            for (row, &half_norm) in products.chunks_exact(width).zip(half_norms) {
+                highest(&mut lanes, &row.as_chunks().0[run], |_| half_norm);
+            }
+            for lane in 0..LANES {
+                // Two selects, not a branch that no processor could predict.
+                let better = lanes[lane] > score[lane];
+                score[lane] = if better { lanes[lane] } else { score[lane] };
+                index[lane] = if better { group } else { index[lane] };
+            }
         }
+    }
+    for (column, (score, index)) in scores.iter().zip(indices).enumerate() {
+        let group_start = (*index as usize).saturating_mul(ROW_GROUP);
+        let rows = products.chunks_exact(width).zip(half_norms).skip(group_start);
+        let found = rows.take(ROW_GROUP).position(|(row, norm)| row[column] - norm == *score);
+        *index = found.map_or(NONE, |row| (first + group_start + row) as u32);
     }
 }

@@ -46,10 +46,17 @@ impl Window {
         squared_norm(gap(0), gap(1), gap(2)) >= self.squared_distance
     }
 
-    /// Sets the products of the pairs that are too far apart to minus infinity. `products` has `width` columns; it
-    /// starts at source row `first` and target row `from`.
-    pub(super) fn mask(&self, first: usize, from: usize, width: usize, products: &mut [f32]) {
-        let [xs, ys, zs] = self.target.each_ref().map(|axis| &axis[from..from + width]);
+    /// Sets the products of the pairs that are too far apart to minus infinity. `products` starts at source row `first`
+    /// and target row `from`; its rows of `columns` numbers stand `width` apart.
+    pub(super) fn mask(
+        &self,
+        first: usize,
+        from: usize,
+        columns: usize,
+        width: usize,
+        products: &mut [f32],
+    ) {
+        let [xs, ys, zs] = self.target.each_ref().map(|axis| &axis[from..from + columns]);
         for (&[x, y, z], row) in self.source[first..].iter().zip(products.chunks_exact_mut(width)) {
             for (product, ((tx, ty), tz)) in row.iter_mut().zip(xs.iter().zip(ys).zip(zs)) {
                 let near = squared_norm(tx - x, ty - y, tz - z) < self.squared_distance;
