@@ -13,3 +13,15 @@ pub(super) fn contain_panics<T>(read: impl FnOnce() -> Result<T>) -> Result<T> {
         Err(Error::invalid("the file is so damaged that its reader gave up: write the file again"))
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_becomes_an_error() {
+        let message = contain_panics::<()>(|| panic!("index out of bounds")).unwrap_err();
+        assert!(message.to_string().contains("its reader gave up"));
+        assert_eq!(contain_panics(|| Ok(7)).unwrap(), 7);
+    }
+}

@@ -67,12 +67,14 @@ fn pose(transform: Option<&Transform>) -> Result<nalgebra::Isometry3<f64>> {
     Ok(nalgebra::Isometry3::from_parts(translation, UnitQuaternion::from_quaternion(quaternion)))
 }
 
-/// Compares the number of points with the bits that one takes: the crate makes up points of no bits without end.
+/// Compares the number of points with the bits that one takes. Points that take none at all, because every column is
+/// constant, are refused however few they are: the crate makes them up without end.
 fn check_count(scan: &PointCloud, length: usize) -> Result<()> {
     let bits: u64 = scan.prototype.iter().map(|record| bits(&record.data_type)).sum();
-    if scan.records.saturating_mul(bits.max(1)) > (length as u64).saturating_mul(8) {
+    if bits == 0 || scan.records.saturating_mul(bits) > (length as u64).saturating_mul(8) {
         return Err(Error::invalid(format!(
-            "a scan of the E57 file promises {} points, the file has {length} bytes: it is cut off or damaged",
+            "a scan of the E57 file promises {} points of {bits} bits, the file has {length} bytes: it is cut off or \
+             damaged, export it again",
             scan.records
         )));
     }

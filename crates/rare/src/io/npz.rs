@@ -107,23 +107,13 @@ impl NpzFile {
         }
         let (archive, length) = (&mut self.archive, self.length);
         contain_panics(|| {
-            let damaged = |error: &dyn std::fmt::Display| {
-                Error::invalid(format!("the entry is damaged ({error}): save it again"))
-            };
             let mut entry = archive
                 .zip_archive()
                 .by_name(&format!("{name}.npy"))
                 .map_err(|error| damaged(&error))?;
-            let method = entry.compression().to_string();
-            if !matches!(method.as_str(), "Stored" | "Deflated") {
-                return Err(Error::Unsupported(format!(
-                    "it is packed with {method}: save it with numpy.savez or numpy.savez_compressed"
-                )));
-            }
-            let (size, packed) = (entry.size(), entry.compressed_size());
-            if packed > length || size > packed.saturating_mul(LARGEST_RATIO) {
-                return Err(damaged(&format!("{packed} packed bytes cannot hold {size}")));
-            }
+            check_packing(&entry.compression().to_string())?;
+            let size = entry.size();
+            check_size(size, entry.compressed_size(), length)?;
             let header = Header::read(&mut entry)?;
             let expected = header.data_length()?;
             if header.length.checked_add(expected).is_none_or(|total| total as u64 != size) {
@@ -132,14 +122,7 @@ impl NpzFile {
                     header.shape
                 )));
             }
-            let mut data = Vec::new();
-            if with_data {
-                data.try_reserve_exact(expected).map_err(|error| damaged(&error))?;
-                entry
-                    .take(expected as u64)
-                    .read_to_end(&mut data)
-                    .map_err(|error| damaged(&error))?;
-            }
+            let data = if with_data { unpack(&mut entry, expected)? } else { Vec::new() };
             Ok((header, data))
         })
     }
@@ -152,40 +135,67 @@ impl NpzFile {
             return Ok("points".to_owned());
         }
         // An array that cannot be read is no candidate, but it is listed.
-        let headers: Vec<(String, Option<Header>)> = names
-            .into_iter()
-            .map(|name| {
-                let header = self.entry(&name, false).ok().map(|(header, _)| header);
-                (name, header)
-            })
-            .collect();
-        let floats = |wanted: fn(usize) -> bool| -> Vec<&str> {
-            let fits = |header: &Header| {
-                header.scalar.is_float()
-                    && matches!(*header.shape.as_slice(), [_, columns] if wanted(columns))
-            };
-            headers
-                .iter()
-                .filter(|(_, header)| header.as_ref().is_some_and(fits))
-                .map(|(name, _)| name.as_str())
-                .collect()
-        };
-        let exact = floats(|columns| columns == 3);
-        let candidates = if exact.is_empty() { floats(|columns| columns > 3) } else { exact };
+        let mut headers = Vec::new();
+        for name in names {
+            let header = self.entry(&name, false).ok().map(|(header, _)| header);
+            headers.push((name, header));
+        }
+        let exact = float_arrays(&headers, |columns| columns == 3);
+        let candidates =
+            if exact.is_empty() { float_arrays(&headers, |columns| columns > 3) } else { exact };
         match candidates.as_slice() {
             [only] => Ok((*only).to_owned()),
             [] => Err(Error::invalid(format!(
-                "no array is a cloud (N x 3 floats), the file has {}",
+                "no array is a cloud (N x 3 floats), the file has {}: save the points as `points`",
                 listed(&headers)
             ))),
-            several => Err(Error::invalid(format!(
-                "the arrays {} could all be the cloud: name one, for example {}:{}",
-                several.join(", "),
-                self.path.display(),
-                several[0]
+            [first, ..] => Err(Error::invalid(format!(
+                "the arrays {} could all be the cloud: name one, for example {}:{first}",
+                candidates.join(", "),
+                self.path.display()
             ))),
         }
     }
+}
+
+fn damaged(error: &dyn std::fmt::Display) -> Error {
+    Error::invalid(format!("the entry is damaged ({error}): save it again"))
+}
+
+fn check_packing(method: &str) -> Result<()> {
+    if matches!(method, "Stored" | "Deflated") {
+        return Ok(());
+    }
+    Err(Error::Unsupported(format!(
+        "it is packed with {method}: save it with numpy.savez or numpy.savez_compressed"
+    )))
+}
+
+fn check_size(size: u64, packed: u64, file_length: u64) -> Result<()> {
+    if packed > file_length || size > packed.saturating_mul(LARGEST_RATIO) {
+        return Err(damaged(&format!("{packed} packed bytes cannot hold {size}")));
+    }
+    Ok(())
+}
+
+fn unpack(entry: &mut dyn Read, length: usize) -> Result<Vec<u8>> {
+    let mut data = Vec::new();
+    data.try_reserve_exact(length).map_err(|error| damaged(&error))?;
+    entry.take(length as u64).read_to_end(&mut data).map_err(|error| damaged(&error))?;
+    Ok(data)
+}
+
+/// The names of the two-dimensional arrays of floats with a `wanted` number of columns.
+fn float_arrays(headers: &[(String, Option<Header>)], wanted: fn(usize) -> bool) -> Vec<&str> {
+    let fits = |header: &Header| {
+        header.scalar.is_float()
+            && matches!(*header.shape.as_slice(), [_, columns] if wanted(columns))
+    };
+    headers
+        .iter()
+        .filter(|(_, header)| header.as_ref().is_some_and(fits))
+        .map(|(name, _)| name.as_str())
+        .collect()
 }
 
 fn listed(headers: &[(String, Option<Header>)]) -> String {
