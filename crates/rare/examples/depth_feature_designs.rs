@@ -88,7 +88,8 @@ fn main() {
                 let good = matches
                     .iter()
                     .filter(|m| {
-                        (truth_from_view.apply(&lifted[1].points()[m.source_index]) - lifted[0].points()[m.target_index])
+                        (truth_from_view.apply(&lifted[1].points()[m.source_index])
+                            - lifted[0].points()[m.target_index])
                             .norm()
                             < 0.1
                     })

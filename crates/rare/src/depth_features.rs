@@ -67,7 +67,9 @@ impl DepthFeatures {
 
     fn validate(&self) -> Result<()> {
         if self.stride == 0 || self.lattice < 2 || self.frequencies == 0 || self.radii.is_empty() {
-            return Err(Error::invalid(format!("the settings of the built-in depth features make no sense: {self:?}")));
+            return Err(Error::invalid(format!(
+                "the settings of the built-in depth features make no sense: {self:?}"
+            )));
         }
         Ok(())
     }
@@ -84,7 +86,8 @@ impl DepthEncoder for DepthFeatures {
 impl DepthFeatures {
     /// One map: `dimension x (height / stride) x (width / stride)`; a cell without depth is all zero.
     fn describe(&self, map: &DepthMap, cosines: &Cosines) -> Result<FeatureMap> {
-        let (rows, columns) = ((map.height() / self.stride).max(1), (map.width() / self.stride).max(1));
+        let (rows, columns) =
+            ((map.height() / self.stride).max(1), (map.width() / self.stride).max(1));
         let (cells, dimension) = (rows * columns, self.dimension());
         let surface = Surface::new(map, self.normal_baseline);
         let mut values = vec![0.0_f32; dimension * cells];
@@ -96,7 +99,9 @@ impl DepthFeatures {
             if map.at(u, v) <= 0.0 {
                 continue;
             }
-            for (&radius, out) in self.radii.iter().zip(descriptor.chunks_exact_mut(dimension / self.radii.len())) {
+            for (&radius, out) in
+                self.radii.iter().zip(descriptor.chunks_exact_mut(dimension / self.radii.len()))
+            {
                 self.sample_patch(&surface, (u, v), radius as f32, &mut patch);
                 cosines.transform(&patch, out);
             }
@@ -109,7 +114,13 @@ impl DepthFeatures {
     }
 
     /// The lattice of half side `radius` around a pixel, row by row; clamped to the image.
-    fn sample_patch(&self, surface: &Surface<'_>, (u, v): (usize, usize), radius: f32, patch: &mut [[f32; CHANNELS]]) {
+    fn sample_patch(
+        &self,
+        surface: &Surface<'_>,
+        (u, v): (usize, usize),
+        radius: f32,
+        patch: &mut [[f32; CHANNELS]],
+    ) {
         let map = surface.map;
         let centre = map.at(u, v);
         let half = (self.lattice - 1) as f32 / 2.0;
@@ -123,13 +134,20 @@ impl DepthFeatures {
         }
     }
 
-    fn sample(&self, surface: &Surface<'_>, pixel: usize, centre: f32, radius: f32) -> [f32; CHANNELS] {
+    fn sample(
+        &self,
+        surface: &Surface<'_>,
+        pixel: usize,
+        centre: f32,
+        radius: f32,
+    ) -> [f32; CHANNELS] {
         let depth = surface.map.depth()[pixel];
         if depth <= 0.0 {
             return [0.0; CHANNELS];
         }
         let relative = (depth - centre) / radius;
-        let [x, y, z] = if relative.abs() > NORMAL_REACH { [0.0; 3] } else { surface.normals[pixel] };
+        let [x, y, z] =
+            if relative.abs() > NORMAL_REACH { [0.0; 3] } else { surface.normals[pixel] };
         [relative.clamp(-1.0, 1.0) * self.depth_weight, x, y, z]
     }
 }
@@ -150,7 +168,8 @@ impl Cosines {
         let n = lattice as f64;
         let value = |frequency: usize, position: usize| {
             let scale = if frequency == 0 { (1.0 / n).sqrt() } else { (2.0 / n).sqrt() };
-            (scale * (std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n).cos()) as f32
+            (scale * (std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n).cos())
+                as f32
         };
         let frequencies = frequencies.min(lattice);
         let basis = (0..frequencies).flat_map(|k| (0..lattice).map(move |i| value(k, i))).collect();
@@ -176,7 +195,10 @@ impl Cosines {
     }
 }
 
-fn weighted_sum<'a>(weights: &[f32], points: impl Iterator<Item = &'a [f32; CHANNELS]>) -> [f32; CHANNELS] {
+fn weighted_sum<'a>(
+    weights: &[f32],
+    points: impl Iterator<Item = &'a [f32; CHANNELS]>,
+) -> [f32; CHANNELS] {
     let mut sum = [0.0; CHANNELS];
     for (weight, point) in weights.iter().zip(points) {
         for (sum, value) in sum.iter_mut().zip(point) {
@@ -195,7 +217,8 @@ struct Surface<'a> {
 impl<'a> Surface<'a> {
     fn new(map: &'a DepthMap, baseline: f64) -> Surface<'a> {
         let width = map.width();
-        let normal = |pixel| normal_at(map, pixel % width, pixel / width, baseline).unwrap_or([0.0; 3]);
+        let normal =
+            |pixel| normal_at(map, pixel % width, pixel / width, baseline).unwrap_or([0.0; 3]);
         Surface { map, normals: (0..map.depth().len()).map(normal).collect() }
     }
 }

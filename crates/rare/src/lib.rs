@@ -9,6 +9,7 @@ pub mod encode;
 pub mod error;
 pub mod features;
 pub mod fuse;
+pub mod hint;
 pub mod io;
 pub mod matching;
 pub mod pose;
@@ -20,10 +21,6 @@ pub mod scale;
 pub mod transfer;
 pub mod verify;
 pub mod viewpoints;
-pub mod hint;
-pub mod project;
-pub mod random;
-pub mod reduce;
 
 pub use data::{
     Camera, Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap,
@@ -31,4 +28,4 @@ pub use data::{
 };
 pub use error::{Error, Result};
 pub use nalgebra;
-pub use refine::{Recipe, Refinement, Refiner, RefinerConfig};
+pub use refine::{InitialMethod, Recipe, Refinement, Refiner, RefinerConfig};

@@ -2,6 +2,7 @@
 
 mod config;
 mod hypotheses;
+mod initial;
 mod stopwatch;
 mod views;
 mod working_pair;
@@ -10,13 +11,15 @@ use nalgebra::Matrix6;
 
 pub use config::{Recipe, RefinerConfig};
 use hypotheses::Candidate;
-pub use stopwatch::Timing;
+pub use initial::InitialMethod;
 use stopwatch::Stopwatch;
+pub use stopwatch::Timing;
 use working_pair::WorkingPair;
 
 use crate::aggregate::vote;
 use crate::data::{
-    Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, LayeredFeatures, RigidTransform, Scan, SetName,
+    Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, LayeredFeatures,
+    RigidTransform, Scan, SetName,
 };
 use crate::densify::Densifier;
 use crate::depth_features::DepthFeatures;
@@ -91,7 +94,10 @@ impl Refiner {
 
     /// Calls `progress` with the name of every step as it begins.
     #[must_use]
-    pub fn with_progress(mut self, progress: impl Fn(&'static str) + Send + Sync + 'static) -> Refiner {
+    pub fn with_progress(
+        mut self,
+        progress: impl Fn(&'static str) + Send + Sync + 'static,
+    ) -> Refiner {
         self.progress = Some(Box::new(progress));
         self
     }
@@ -101,8 +107,13 @@ impl Refiner {
     /// # Errors
     /// `InvalidInput` if a cloud is degenerate (fewer than three points, all on one line), the features of the sides
     /// do not fit, or a setting makes no sense.
-    pub fn refine(&self, source: &Scan, target: &Scan, initial: &RigidTransform) -> Result<Refinement> {
-        self.run(source, target, initial, None)
+    pub fn refine(
+        &self,
+        source: &Scan,
+        target: &Scan,
+        initial: &RigidTransform,
+    ) -> Result<Refinement> {
+        self.refine_with(source, target, initial, None)
     }
 
     /// The same with correspondences of another method (each side in its cloud's own frame, metres) in the place of
@@ -117,34 +128,66 @@ impl Refiner {
         initial: &RigidTransform,
         pairs: &[Correspondence],
     ) -> Result<Refinement> {
-        self.run(source, target, initial, Some(pairs))
+        self.refine_with(source, target, initial, Some(pairs))
     }
 
-    fn run(
+    fn refine_with(
         &self,
         source: &Scan,
         target: &Scan,
         initial: &RigidTransform,
         given: Option<&[Correspondence]>,
     ) -> Result<Refinement> {
-        let mut clock = Stopwatch::new(self.progress.as_deref());
+        let mut clock = self.stopwatch();
         let pair = clock.time("prepare", || WorkingPair::new(source, target, &self.config))?;
         let given = given.map(|pairs| pair.to_working_pairs(pairs));
-        let initial = pair.to_working(initial);
-        let verifier = clock.time("verify", || self.verifier(&pair, &initial));
-        let mut best = Candidate::judged(initial, &verifier);
+        self.run(&pair, &pair.to_working(initial), given.as_deref(), clock)
+    }
+
+    /// Registers clouds of which nothing is known: makes an initial transform, then refines it.
+    ///
+    /// # Errors
+    /// As [`Refiner::refine`]; `NoPose` if the clouds have no consistent features in common.
+    pub fn register(
+        &self,
+        source: &Scan,
+        target: &Scan,
+        method: InitialMethod,
+    ) -> Result<Refinement> {
+        let mut clock = self.stopwatch();
+        let pair = clock.time("prepare", || WorkingPair::new(source, target, &self.config))?;
+        let start = self.verifier(&pair, &RigidTransform::identity());
+        let initial =
+            clock.time("initial", || initial::estimate(&pair, method, self.config.seed, &start))?;
+        self.run(&pair, &initial, None, clock)
+    }
+
+    /// Rounds of the paper's method, each from the pose of the one before.
+    fn run(
+        &self,
+        pair: &WorkingPair<'_>,
+        initial: &RigidTransform,
+        given: Option<&[Correspondence]>,
+        mut clock: Stopwatch<'_>,
+    ) -> Result<Refinement> {
+        let verifier = clock.time("verify", || self.verifier(pair, initial));
+        let mut best = Candidate::judged(*initial, &verifier);
         let mut sets = CorrespondenceSets::default();
         for _ in 0..self.config.recipe.rounds {
-            sets = self.correspondence_sets(&pair, &best.target_from_source, given.as_deref(), &mut clock)?;
-            let next = self.next_candidate(&pair, &sets, &best, &verifier, &mut clock)?;
+            sets = self.correspondence_sets(pair, &best.target_from_source, given, &mut clock)?;
+            let next = self.next_candidate(pair, &sets, &best, &verifier, &mut clock)?;
             let settled = next.settled(&best, pair.scale.voxel);
             best = next;
             if settled {
                 break;
             }
         }
-        let evidence = clock.time("verify", || self.evidence(&pair, &initial, &best, &sets));
+        let evidence = clock.time("verify", || self.evidence(pair, initial, &best, &sets));
         Ok(Refinement { timings: clock.into_timings(), ..evidence })
+    }
+
+    fn stopwatch(&self) -> Stopwatch<'_> {
+        Stopwatch::new(self.progress.as_deref())
     }
 
     /// Steps 1 to 7: the correspondence sets seen under a pose.
@@ -180,9 +223,13 @@ impl Refiner {
         let recipe = &self.config.recipe;
         let proposed = clock.time("aggregate", || hypotheses::propose(recipe, &pair.scale, sets));
         if !recipe.keep_initial {
-            return Ok(Candidate::judged(proposed?.first().copied().unwrap_or(current.target_from_source), verifier));
+            return Ok(Candidate::judged(
+                proposed?.first().copied().unwrap_or(current.target_from_source),
+                verifier,
+            ));
         }
-        let ranked = clock.time("verify", || hypotheses::rank(&proposed.unwrap_or_default(), current, verifier));
+        let ranked = clock
+            .time("verify", || hypotheses::rank(&proposed.unwrap_or_default(), current, verifier));
         if !recipe.polish {
             return Ok(ranked.into_iter().next().unwrap_or(*current));
         }
@@ -190,11 +237,22 @@ impl Refiner {
     }
 
     fn viewpoints(&self, pair: &WorkingPair<'_>, pose: &RigidTransform) -> Vec<Viewpoint> {
-        viewpoints::choose(self.config.camera, &pair.scale, &pair.target.coarse, &pair.source.coarse, pose)
+        viewpoints::choose(
+            self.config.camera,
+            &pair.scale,
+            &pair.target.coarse,
+            &pair.source.coarse,
+            pose,
+        )
     }
 
     fn verifier<'a>(&self, pair: &'a WorkingPair<'_>, pose: &RigidTransform) -> Verifier<'a> {
-        Verifier::new(&pair.target.points, &pair.source.points, &self.viewpoints(pair, pose), pair.scale.voxel)
+        Verifier::new(
+            &pair.target.points,
+            &pair.source.points,
+            &self.viewpoints(pair, pose),
+            pair.scale.voxel,
+        )
     }
 
     /// The recipe's filters: `fast` indoors and in working units, `multiscale` for streets in metres.
@@ -211,7 +269,11 @@ impl Refiner {
     }
 
     fn sampling(&self) -> Sampling {
-        if self.config.recipe.aligned_corners { Sampling::AlignedCorners } else { Sampling::OwnCell }
+        if self.config.recipe.aligned_corners {
+            Sampling::AlignedCorners
+        } else {
+            Sampling::OwnCell
+        }
     }
 
     /// Everything that is known of the final pose.

@@ -91,7 +91,9 @@ pub fn lift(map: &FeatureMap, depth: &DepthMap, range: DepthRange, sampling: Sam
             continue;
         }
         match sampling {
-            Sampling::OwnCell => feature.copy_from_slice(&values[cell * map.channels()..][..map.channels()]),
+            Sampling::OwnCell => {
+                feature.copy_from_slice(&values[cell * map.channels()..][..map.channels()])
+            }
             Sampling::AlignedCorners => {
                 let x = Tap::new(u, width, map.width());
                 let y = Tap::new(v, height, map.height());

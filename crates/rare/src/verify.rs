@@ -81,10 +81,20 @@ impl<'a> Verifier<'a> {
         let own_view = |viewpoint: &Viewpoint| {
             let cloud = if viewpoint.frame == Frame::Reference { reference } else { source };
             let viewpoint = shrunk(viewpoint);
-            let own = project_moved(cloud, &viewpoint.camera.camera_from_world, &viewpoint.camera.intrinsics).depth_map;
+            let own = project_moved(
+                cloud,
+                &viewpoint.camera.camera_from_world,
+                &viewpoint.camera.intrinsics,
+            )
+            .depth_map;
             OwnView { viewpoint, own }
         };
-        Verifier { reference, source, views: viewpoints.par_iter().map(own_view).collect(), tolerance }
+        Verifier {
+            reference,
+            source,
+            views: viewpoints.par_iter().map(own_view).collect(),
+            tolerance,
+        }
     }
 
     /// Compares the clouds in all cameras under a pose.
@@ -94,10 +104,16 @@ impl<'a> Verifier<'a> {
             .par_iter()
             .map(|view| {
                 let (cloud, camera_from_cloud) = match view.viewpoint.frame {
-                    Frame::Reference => (self.source, view.viewpoint.camera_from_source(reference_from_source)),
-                    Frame::Source => (self.reference, view.viewpoint.camera_from_reference(reference_from_source)),
+                    Frame::Reference => {
+                        (self.source, view.viewpoint.camera_from_source(reference_from_source))
+                    }
+                    Frame::Source => (
+                        self.reference,
+                        view.viewpoint.camera_from_reference(reference_from_source),
+                    ),
                 };
-                let moved = project_moved(cloud, &camera_from_cloud, view.own.intrinsics()).depth_map;
+                let moved =
+                    project_moved(cloud, &camera_from_cloud, view.own.intrinsics()).depth_map;
                 compare(&view.own, &moved, self.tolerance)
             })
             .reduce(DepthConsistency::default, |a, b| DepthConsistency {

@@ -38,7 +38,11 @@ impl Candidate {
 }
 
 /// Step 8: transforms proposed by the sets, the paper's aggregate first.
-pub(super) fn propose(recipe: &Recipe, scale: &Scale, sets: &CorrespondenceSets) -> Result<Vec<RigidTransform>> {
+pub(super) fn propose(
+    recipe: &Recipe,
+    scale: &Scale,
+    sets: &CorrespondenceSets,
+) -> Result<Vec<RigidTransform>> {
     let config = Aggregation {
         acceptance_radius: scale.acceptance_radius,
         reweighting_rounds: recipe.reweighting_rounds,
@@ -62,7 +66,11 @@ fn by_consensus(scale: &Scale, sets: &CorrespondenceSets) -> Vec<RigidTransform>
         // A set without consensus has nothing to say.
         estimator.hypotheses(&pairs, HYPOTHESES_PER_SET).unwrap_or_default()
     };
-    sets.sets.par_iter().flat_map_iter(|set| hypotheses(&set.pairs)).map(|estimate| estimate.target_from_source).collect()
+    sets.sets
+        .par_iter()
+        .flat_map_iter(|set| hypotheses(&set.pairs))
+        .map(|estimate| estimate.target_from_source)
+        .collect()
 }
 
 fn keep_best_scored(pairs: &mut Vec<Correspondence>, count: usize) {
@@ -71,7 +79,11 @@ fn keep_best_scored(pairs: &mut Vec<Correspondence>, count: usize) {
 }
 
 /// Step 9: all hypotheses and the current pose, the most consistent first; of equals the current one, then the earlier.
-pub(super) fn rank(proposed: &[RigidTransform], current: &Candidate, verifier: &Verifier<'_>) -> Vec<Candidate> {
+pub(super) fn rank(
+    proposed: &[RigidTransform],
+    current: &Candidate,
+    verifier: &Verifier<'_>,
+) -> Vec<Candidate> {
     let judged = proposed.iter().map(|pose| Candidate::judged(*pose, verifier));
     let mut ranked: Vec<Candidate> = std::iter::once(*current).chain(judged).collect();
     ranked.sort_by(|a, b| b.consistency.score().total_cmp(&a.consistency.score()));
@@ -79,10 +91,16 @@ pub(super) fn rank(proposed: &[RigidTransform], current: &Candidate, verifier: &
 }
 
 /// The best candidates moved onto the surface; of those and the unpolished ones, the most consistent.
-pub(super) fn polish(pair: &WorkingPair<'_>, ranked: &[Candidate], verifier: &Verifier<'_>) -> Candidate {
+pub(super) fn polish(
+    pair: &WorkingPair<'_>,
+    ranked: &[Candidate],
+    verifier: &Verifier<'_>,
+) -> Candidate {
     let icp = polish_schedule(pair.scale.voxel);
     let polished = ranked.par_iter().take(POLISHED).filter_map(|candidate| {
-        let aligned = icp.align(&pair.source.coarse, &pair.target.surface, &candidate.target_from_source).ok()?;
+        let aligned = icp
+            .align(&pair.source.coarse, &pair.target.surface, &candidate.target_from_source)
+            .ok()?;
         Some(Candidate::judged(aligned.target_from_source, verifier))
     });
     let mut all: Vec<Candidate> = polished.collect();
@@ -93,7 +111,8 @@ pub(super) fn polish(pair: &WorkingPair<'_>, ranked: &[Candidate], verifier: &Ve
 
 /// Tukey point-to-plane within three voxels, then one and a half: 15 cm and 7.5 cm indoors.
 fn polish_schedule(voxel: f64) -> Icp {
-    let stage = |voxels: f64| IcpStage { max_distance: voxels * voxel, kernel_width: voxels * voxel };
+    let stage =
+        |voxels: f64| IcpStage { max_distance: voxels * voxel, kernel_width: voxels * voxel };
     Icp {
         kernel: RobustKernel::Tukey,
         stages: vec![stage(3.0), stage(1.5)],

@@ -31,7 +31,8 @@ pub(super) fn project_all(
 ) -> Vec<DepthMap> {
     let see = |view: &Viewpoint| {
         let camera = &view.camera.intrinsics;
-        let reference = project_moved(&pair.target.points, &view.camera_from_reference(pose), camera);
+        let reference =
+            project_moved(&pair.target.points, &view.camera_from_reference(pose), camera);
         let source = project_moved(&pair.source.points, &view.camera_from_source(pose), camera);
         [reference.depth_map, source.depth_map]
     };
@@ -69,17 +70,22 @@ pub(super) fn transfer_all(
     sampling: Sampling,
 ) -> Vec<Both<PointFeatures>> {
     let (maps, _) = maps.as_chunks::<2>();
-    let lift_view = |view: &Viewpoint, [reference, source]: &[DepthMap; 2], features: &Both<FeatureMap>| {
-        let in_own_frame = |features, map, camera_from_cloud: RigidTransform| {
-            let cloud_from_camera = camera_from_cloud.inverse();
-            let lifted = lift(features, map, pair.scale.depth_range, sampling).keypoints;
-            lifted.map_points(|point| cloud_from_camera.apply(point))
+    let lift_view =
+        |view: &Viewpoint, [reference, source]: &[DepthMap; 2], features: &Both<FeatureMap>| {
+            let in_own_frame = |features, map, camera_from_cloud: RigidTransform| {
+                let cloud_from_camera = camera_from_cloud.inverse();
+                let lifted = lift(features, map, pair.scale.depth_range, sampling).keypoints;
+                lifted.map_points(|point| cloud_from_camera.apply(point))
+            };
+            Both {
+                reference: in_own_frame(
+                    &features.reference,
+                    reference,
+                    view.camera_from_reference(pose),
+                ),
+                source: in_own_frame(&features.source, source, view.camera_from_source(pose)),
+            }
         };
-        Both {
-            reference: in_own_frame(&features.reference, reference, view.camera_from_reference(pose)),
-            source: in_own_frame(&features.source, source, view.camera_from_source(pose)),
-        }
-    };
     let views: Vec<_> = viewpoints.iter().zip(maps).zip(features).collect();
     views.into_par_iter().map(|((view, maps), features)| lift_view(view, maps, features)).collect()
 }
@@ -110,13 +116,15 @@ pub(super) fn match_all(
     fused: &[Both<PointFeatures>],
     given: Option<&[Correspondence]>,
 ) -> Result<CorrespondenceSets> {
-    let in_views = |frame, features: &[Both<PointFeatures>], kinds| -> Result<Vec<Correspondence>> {
-        let mut pairs = Vec::new();
-        for (_, view) in viewpoints.iter().zip(features).filter(|(view, _)| view.frame == frame) {
-            pairs.extend(matched(&view.source, &view.reference, kinds)?);
-        }
-        Ok(pairs)
-    };
+    let in_views =
+        |frame, features: &[Both<PointFeatures>], kinds| -> Result<Vec<Correspondence>> {
+            let mut pairs = Vec::new();
+            for (_, view) in viewpoints.iter().zip(features).filter(|(view, _)| view.frame == frame)
+            {
+                pairs.extend(matched(&view.source, &view.reference, kinds)?);
+            }
+            Ok(pairs)
+        };
     let features_3d = match given {
         Some(pairs) => pairs.to_vec(),
         None => matched(&pair.source.keypoints, &pair.target.keypoints, 1)?,
@@ -132,7 +140,11 @@ pub(super) fn match_all(
     Ok(CorrespondenceSets { sets })
 }
 
-fn matched(source: &PointFeatures, target: &PointFeatures, kinds: usize) -> Result<Vec<Correspondence>> {
+fn matched(
+    source: &PointFeatures,
+    target: &PointFeatures,
+    kinds: usize,
+) -> Result<Vec<Correspondence>> {
     let matches = mutual_nearest(source, target, None)?;
     Ok(correspondences(source, target, &matches, kinds))
 }

@@ -7,7 +7,9 @@ use std::borrow::Cow;
 
 use nalgebra::{Matrix3, Point3, Vector3};
 
-use crate::data::{Correspondence, KdTree, PointCloud, PointFeatures, RigidTransform, Scan, voxel_downsample};
+use crate::data::{
+    Correspondence, KdTree, PointCloud, PointFeatures, RigidTransform, Scan, voxel_downsample,
+};
 use crate::error::{Error, Result};
 use crate::features::{estimate_normals, fpfh_at, orient_towards};
 use crate::pose::IcpTarget;
@@ -27,8 +29,8 @@ pub(crate) struct WorkingPair<'a> {
     pub(crate) scale: Scale,
     /// Metres per working unit.
     pub(crate) unit: f64,
-    source_cloud: &'a PointCloud,
-    target_cloud: &'a PointCloud,
+    pub(crate) source_cloud: &'a PointCloud,
+    pub(crate) target_cloud: &'a PointCloud,
 }
 
 /// One cloud; local frame, working units.
@@ -49,7 +51,11 @@ impl<'a> WorkingPair<'a> {
     /// # Errors
     /// `InvalidInput` if a cloud has fewer than three points, no extent or a single line of points, if only one side
     /// brings features, or if their dimensions differ.
-    pub(crate) fn new(source: &'a Scan, target: &'a Scan, config: &RefinerConfig) -> Result<WorkingPair<'a>> {
+    pub(crate) fn new(
+        source: &'a Scan,
+        target: &'a Scan,
+        config: &RefinerConfig,
+    ) -> Result<WorkingPair<'a>> {
         check_shape("source", &source.cloud)?;
         check_shape("reference", &target.cloud)?;
         check_features(source, target)?;
@@ -77,7 +83,10 @@ impl<'a> WorkingPair<'a> {
 
     /// A pose between the working frames as one between the callers' frames.
     pub(crate) fn to_world(&self, target_from_source: &RigidTransform) -> RigidTransform {
-        let local = RigidTransform::new(*target_from_source.rotation(), target_from_source.translation() * self.unit);
+        let local = RigidTransform::new(
+            *target_from_source.rotation(),
+            target_from_source.translation() * self.unit,
+        );
         PointCloud::to_world(self.target_cloud, self.source_cloud, &local)
     }
 
@@ -102,7 +111,10 @@ impl<'a> WorkingPair<'a> {
         let mut warnings = Vec::new();
         for (name, cloud) in [("source", self.source_cloud), ("reference", self.target_cloud)] {
             if cloud.dropped() > 0 {
-                warnings.push(format!("{} points of the {name} cloud are not finite and were dropped", cloud.dropped()));
+                warnings.push(format!(
+                    "{} points of the {name} cloud are not finite and were dropped",
+                    cloud.dropped()
+                ));
             }
         }
         warnings
@@ -110,7 +122,13 @@ impl<'a> WorkingPair<'a> {
 }
 
 impl<'a> WorkingCloud<'a> {
-    fn new(scan: &'a Scan, scale: &Scale, unit: f64, config: &RefinerConfig, stream: u64) -> Result<WorkingCloud<'a>> {
+    fn new(
+        scan: &'a Scan,
+        scale: &Scale,
+        unit: f64,
+        config: &RefinerConfig,
+        stream: u64,
+    ) -> Result<WorkingCloud<'a>> {
         let points = in_units(scan.cloud.points(), unit);
         let coarse = voxel_downsample(&points, scale.voxel)?;
         let surface = surface(&points, scale)?;
@@ -122,10 +140,24 @@ impl<'a> WorkingCloud<'a> {
         };
         Ok(WorkingCloud { points, coarse, surface, keypoints })
     }
+
+    /// Fast point feature histograms at `count` seeded voxel points.
+    pub(crate) fn histograms(
+        &self,
+        scale: &Scale,
+        count: usize,
+        random: &mut Random,
+    ) -> Result<PointFeatures> {
+        histograms(&self.coarse, scale, count, random)
+    }
 }
 
 fn in_units(points: &[Point3<f64>], unit: f64) -> Cow<'_, [Point3<f64>]> {
-    if unit == 1.0 { Cow::Borrowed(points) } else { Cow::Owned(points.iter().map(|point| point / unit).collect()) }
+    if unit == 1.0 {
+        Cow::Borrowed(points)
+    } else {
+        Cow::Owned(points.iter().map(|point| point / unit).collect())
+    }
 }
 
 /// Half-voxel points with normals from 30 neighbours within two voxels.
@@ -137,15 +169,26 @@ fn surface(points: &[Point3<f64>], scale: &Scale) -> Result<IcpTarget> {
 }
 
 /// The caller's keypoints in the working frame, at most `count` of them.
-fn sampled(features: &PointFeatures, shift: &Vector3<f64>, unit: f64, count: usize, random: &mut Random) -> PointFeatures {
+fn sampled(
+    features: &PointFeatures,
+    shift: &Vector3<f64>,
+    unit: f64,
+    count: usize,
+    random: &mut Random,
+) -> PointFeatures {
     let mut chosen = random.sample(count, features.len());
     chosen.sort_unstable();
-    features.select(&chosen).map_points(|point| (point - shift) / unit)
+    features.select(&chosen).normalised().map_points(|point| (point - shift) / unit)
 }
 
 /// Fast point feature histograms at `count` random voxel points: normals from 30 neighbours within 2 voxels, features
 /// from 100 neighbours within 5, as the official evaluations have it.
-fn histograms(coarse: &[Point3<f64>], scale: &Scale, count: usize, random: &mut Random) -> Result<PointFeatures> {
+fn histograms(
+    coarse: &[Point3<f64>],
+    scale: &Scale,
+    count: usize,
+    random: &mut Random,
+) -> Result<PointFeatures> {
     let tree = KdTree::new(coarse);
     let mut normals = estimate_normals(coarse, &tree, 2.0 * scale.voxel, 30);
     if scale.kind != SceneKind::Object {
@@ -153,7 +196,7 @@ fn histograms(coarse: &[Point3<f64>], scale: &Scale, count: usize, random: &mut 
     }
     let mut chosen = random.sample(count, coarse.len());
     chosen.sort_unstable();
-    fpfh_at(coarse, &normals, &tree, 5.0 * scale.voxel, 100, &chosen)
+    Ok(fpfh_at(coarse, &normals, &tree, 5.0 * scale.voxel, 100, &chosen)?.normalised())
 }
 
 /// Three points that are not on one line are the least that determine a pose.
@@ -174,7 +217,9 @@ fn check_shape(name: &str, cloud: &PointCloud) -> Result<()> {
     let mut spread = scatter.symmetric_eigenvalues();
     spread.as_mut_slice().sort_by(f64::total_cmp);
     if spread[2] <= 0.0 {
-        return Err(Error::invalid(format!("all points of the {name} cloud are identical: nothing can be registered")));
+        return Err(Error::invalid(format!(
+            "all points of the {name} cloud are identical: nothing can be registered"
+        )));
     }
     if spread[1] <= 1e-12 * spread[2] {
         return Err(Error::invalid(format!(
@@ -186,14 +231,16 @@ fn check_shape(name: &str, cloud: &PointCloud) -> Result<()> {
 
 fn check_features(source: &Scan, target: &Scan) -> Result<()> {
     match (&source.features, &target.features) {
-        (Some(_), None) | (None, Some(_)) => {
-            Err(Error::invalid("only one of the clouds has features: give them for both, or for neither"))
+        (Some(_), None) | (None, Some(_)) => Err(Error::invalid(
+            "only one of the clouds has features: give them for both, or for neither",
+        )),
+        (Some(source), Some(target)) if source.dimension() != target.dimension() => {
+            Err(Error::invalid(format!(
+                "the source features have {} dimensions, those of the reference {}: they must be the same features",
+                source.dimension(),
+                target.dimension()
+            )))
         }
-        (Some(source), Some(target)) if source.dimension() != target.dimension() => Err(Error::invalid(format!(
-            "the source features have {} dimensions, those of the reference {}: they must be the same features",
-            source.dimension(),
-            target.dimension()
-        ))),
         _ => Ok(()),
     }
 }

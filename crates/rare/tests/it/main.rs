@@ -7,22 +7,20 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
-mod densify;
-mod matching;
-mod project;
 mod aggregate;
+mod clouds;
+mod densify;
+mod fpfh;
+mod hint;
+mod hostile_files;
 mod matching;
 mod metrics;
-mod fpfh;
-mod ransac;
-mod sc2_pcr;
-mod clouds;
-mod hostile_files;
 mod poses;
-mod hint;
 mod project;
+mod ransac;
 mod reduce;
+mod sc2_pcr;
 mod shared;
-mod transfer;
 mod synthetic_pairs;
+mod transfer;
 mod weighted_fit;
