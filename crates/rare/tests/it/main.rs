@@ -9,6 +9,7 @@
 
 mod fpfh;
 mod ransac;
+mod real_pairs;
 mod sc2_pcr;
 mod shared;
 mod synthetic_pairs;
