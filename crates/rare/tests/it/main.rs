@@ -19,6 +19,7 @@ mod poses;
 mod project;
 mod ransac;
 mod reduce;
+mod real_pairs;
 mod sc2_pcr;
 mod shared;
 mod synthetic_pairs;
