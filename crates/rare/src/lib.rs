@@ -4,6 +4,7 @@
 pub mod data;
 pub mod error;
 pub mod random;
+pub mod synthetic;
 
 pub use data::{
     Camera, Correspondence, DepthMap, FeatureMap, Intrinsics, PointCloud, PointFeatures,
