@@ -21,6 +21,7 @@ pub mod scale;
 pub mod transfer;
 pub mod verify;
 pub mod viewpoints;
+pub mod synthetic;
 
 pub use data::{
     Camera, Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap,
