@@ -18,10 +18,10 @@ pub mod random;
 pub mod reduce;
 pub mod refine;
 pub mod scale;
+pub mod synthetic;
 pub mod transfer;
 pub mod verify;
 pub mod viewpoints;
-pub mod synthetic;
 
 pub use data::{
     Camera, Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, FeatureMap,
