@@ -93,6 +93,7 @@ impl DepthFeatures {
         let mut values = vec![0.0_f32; dimension * cells];
         let mut descriptor = vec![0.0_f32; dimension];
         let mut patch = vec![[0.0_f32; CHANNELS]; self.lattice * self.lattice];
+        let mut sums = vec![[0.0_f32; CHANNELS]; self.lattice];
         for cell in 0..cells {
             let u = (cell % columns) * self.stride + self.stride / 2;
             let v = (cell / columns) * self.stride + self.stride / 2;
@@ -103,7 +104,7 @@ impl DepthFeatures {
                 self.radii.iter().zip(descriptor.chunks_exact_mut(dimension / self.radii.len()))
             {
                 self.sample_patch(&surface, (u, v), radius as f32, &mut patch);
-                cosines.transform(&patch, out);
+                cosines.transform(&patch, &mut sums, out);
             }
             let norm = descriptor.iter().map(|value| value * value).sum::<f32>().sqrt() + 1e-6;
             for (channel, value) in descriptor.iter().enumerate() {
@@ -129,26 +130,18 @@ impl DepthFeatures {
             let y = nearest_pixel(v as f32 + (row as f32 - half) * step, map.height());
             for (column, point) in points.iter_mut().enumerate() {
                 let x = nearest_pixel(u as f32 + (column as f32 - half) * step, map.width());
-                *point = self.sample(surface, y * map.width() + x, centre, radius);
+                *point = self.sample(surface.pixels[y * map.width() + x], centre, radius);
             }
         }
     }
 
-    fn sample(
-        &self,
-        surface: &Surface<'_>,
-        pixel: usize,
-        centre: f32,
-        radius: f32,
-    ) -> [f32; CHANNELS] {
-        let depth = surface.map.depth()[pixel];
+    fn sample(&self, [x, y, z, depth]: [f32; CHANNELS], centre: f32, radius: f32) -> [f32; CHANNELS] {
         if depth <= 0.0 {
             return [0.0; CHANNELS];
         }
         let relative = (depth - centre) / radius;
-        let [x, y, z] =
-            if relative.abs() > NORMAL_REACH { [0.0; 3] } else { surface.normals[pixel] };
-        [relative.clamp(-1.0, 1.0) * self.depth_weight, x, y, z]
+        let facing = if relative.abs() > NORMAL_REACH { 0.0 } else { 1.0 };
+        [relative.clamp(-1.0, 1.0) * self.depth_weight, x * facing, y * facing, z * facing]
     }
 }
 
@@ -168,8 +161,8 @@ impl Cosines {
         let n = lattice as f64;
         let value = |frequency: usize, position: usize| {
             let scale = if frequency == 0 { (1.0 / n).sqrt() } else { (2.0 / n).sqrt() };
-            (scale * (std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n).cos())
-                as f32
+            let angle = std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n;
+            (scale * angle.cos()) as f32
         };
         let frequencies = frequencies.min(lattice);
         let basis = (0..frequencies).flat_map(|k| (0..lattice).map(move |i| value(k, i))).collect();
@@ -177,68 +170,96 @@ impl Cosines {
     }
 
     /// Transforms a lattice of points; coefficients whose indices add up to less than the number of frequencies, each
-    /// with all channels.
-    fn transform(&self, patch: &[[f32; CHANNELS]], out: &mut [f32]) {
+    /// with all channels. `sums` is working memory, one row of the lattice.
+    fn transform(&self, patch: &[[f32; CHANNELS]], sums: &mut [[f32; CHANNELS]], out: &mut [f32]) {
         let frequencies = self.basis.len() / self.lattice;
-        let mut columns = vec![[0.0; CHANNELS]; self.lattice];
         let mut out = out.chunks_exact_mut(CHANNELS);
         for (down, basis_down) in self.basis.chunks_exact(self.lattice).enumerate() {
-            for (column, sum) in columns.iter_mut().enumerate() {
-                *sum = weighted_sum(basis_down, patch.iter().skip(column).step_by(self.lattice));
+            sums.fill([0.0; CHANNELS]);
+            for (weight, row) in basis_down.iter().zip(patch.chunks_exact(self.lattice)) {
+                for (sum, point) in sums.iter_mut().zip(row) {
+                    add_scaled(sum, *weight, point);
+                }
             }
             for basis_across in self.basis.chunks_exact(self.lattice).take(frequencies - down) {
+                let mut coefficient = [0.0; CHANNELS];
+                for (weight, sum) in basis_across.iter().zip(&*sums) {
+                    add_scaled(&mut coefficient, *weight, sum);
+                }
                 if let Some(out) = out.next() {
-                    out.copy_from_slice(&weighted_sum(basis_across, columns.iter()));
+                    out.copy_from_slice(&coefficient);
                 }
             }
         }
     }
 }
 
-fn weighted_sum<'a>(
-    weights: &[f32],
-    points: impl Iterator<Item = &'a [f32; CHANNELS]>,
-) -> [f32; CHANNELS] {
-    let mut sum = [0.0; CHANNELS];
-    for (weight, point) in weights.iter().zip(points) {
-        for (sum, value) in sum.iter_mut().zip(point) {
-            *sum += weight * value;
-        }
+fn add_scaled(sum: &mut [f32; CHANNELS], weight: f32, point: &[f32; CHANNELS]) {
+    for (sum, value) in sum.iter_mut().zip(point) {
+        *sum += weight * value;
     }
-    sum
 }
 
-/// A depth map with unit normals in the camera's frame; zero where a neighbour is missing.
+/// What is seen at each pixel of a depth map: the unit normal in the camera's frame (zero where a neighbour is
+/// missing), then the depth.
 struct Surface<'a> {
     map: &'a DepthMap,
-    normals: Vec<[f32; 3]>,
+    pixels: Vec<[f32; CHANNELS]>,
 }
 
 impl<'a> Surface<'a> {
     fn new(map: &'a DepthMap, baseline: f64) -> Surface<'a> {
-        let width = map.width();
-        let normal =
-            |pixel| normal_at(map, pixel % width, pixel / width, baseline).unwrap_or([0.0; 3]);
-        Surface { map, normals: (0..map.depth().len()).map(normal).collect() }
+        let mut pixels = vec![[0.0; CHANNELS]; map.depth().len()];
+        let focal_baseline = (baseline * map.intrinsics().fx) as f32;
+        let rays = Rays::new(map);
+        let (least, most) = BASELINE_PIXELS;
+        for (v, row) in pixels.chunks_exact_mut(map.width()).enumerate() {
+            for (u, pixel) in row.iter_mut().enumerate() {
+                let depth = map.depth()[v * map.width() + u];
+                if depth > 0.0 {
+                    let step = ((focal_baseline / depth) as usize).clamp(least, most);
+                    let [x, y, z] = rays.normal(u, v, step).unwrap_or([0.0; 3]);
+                    *pixel = [x, y, z, depth];
+                }
+            }
+        }
+        Surface { map, pixels }
     }
 }
 
-/// The normal from the four neighbours at a fixed metric distance.
-fn normal_at(map: &DepthMap, u: usize, v: usize, baseline: f64) -> Option<[f32; 3]> {
-    let intrinsics = map.intrinsics();
-    let seen = |u: usize, v: usize| Some(map.at(u, v)).filter(|&depth| depth > 0.0);
-    let centre = seen(u, v)?;
-    let pixels = (baseline * intrinsics.fx / f64::from(centre)) as usize;
-    let step = pixels.clamp(BASELINE_PIXELS.0, BASELINE_PIXELS.1);
-    let point = |u: usize, v: usize| {
-        let depth = seen(u, v)?;
-        let x = (u as f32 - intrinsics.cx as f32) / intrinsics.fx as f32;
-        let y = (v as f32 - intrinsics.cy as f32) / intrinsics.fy as f32;
-        Some(Vector3::new(x, y, 1.0) * depth)
-    };
-    let across = point(u + step, v)? - point(u.checked_sub(step)?, v)?;
-    let down = point(u, v + step)? - point(u, v.checked_sub(step)?)?;
-    let normal = across.cross(&down);
-    let length = normal.norm();
-    (length > 0.0).then(|| (normal / length).into())
+/// The viewing rays of a map's columns and rows, at depth 1.
+struct Rays<'a> {
+    map: &'a DepthMap,
+    x: Vec<f32>,
+    y: Vec<f32>,
+}
+
+impl<'a> Rays<'a> {
+    fn new(map: &'a DepthMap) -> Rays<'a> {
+        let camera = map.intrinsics();
+        let axis = |size, centre: f64, focal: f64| {
+            (0..size).map(|i| ((i as f64 - centre) / focal) as f32).collect()
+        };
+        Rays {
+            map,
+            x: axis(map.width(), camera.cx, camera.fx),
+            y: axis(map.height(), camera.cy, camera.fy),
+        }
+    }
+
+    /// The normal from the four neighbours `step` pixels away; `None` at the border and beside holes.
+    fn normal(&self, u: usize, v: usize, step: usize) -> Option<[f32; 3]> {
+        let (left, top) = (u.checked_sub(step)?, v.checked_sub(step)?);
+        let across = self.point(u + step, v)? - self.point(left, v)?;
+        let down = self.point(u, v + step)? - self.point(u, top)?;
+        let normal = across.cross(&down);
+        let length = normal.norm();
+        (length > 0.0).then(|| (normal / length).into())
+    }
+
+    fn point(&self, u: usize, v: usize) -> Option<Vector3<f32>> {
+        let (x, y) = (self.x.get(u)?, self.y.get(v)?);
+        let depth = *self.map.depth().get(v * self.map.width() + u)?;
+        (depth > 0.0).then(|| Vector3::new(x * depth, y * depth, depth))
+    }
 }

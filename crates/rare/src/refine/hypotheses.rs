@@ -99,7 +99,7 @@ pub(super) fn polish(
     let icp = polish_schedule(pair.scale.voxel);
     let polished = ranked.par_iter().take(POLISHED).filter_map(|candidate| {
         let aligned = icp
-            .align(&pair.source.coarse, &pair.target.surface, &candidate.target_from_source)
+            .align(&pair.source.coarse, &pair.target_surface, &candidate.target_from_source)
             .ok()?;
         Some(Candidate::judged(aligned.target_from_source, verifier))
     });

@@ -25,6 +25,8 @@ const WORKING_VOXEL: f64 = 0.05;
 pub(crate) struct WorkingPair<'a> {
     pub(crate) source: WorkingCloud<'a>,
     pub(crate) target: WorkingCloud<'a>,
+    /// The target's half-voxel points with normals and an index: what the polish aligns to.
+    pub(crate) target_surface: IcpTarget,
     /// All thresholds, working units.
     pub(crate) scale: Scale,
     /// Metres per working unit.
@@ -39,8 +41,8 @@ pub(crate) struct WorkingCloud<'a> {
     pub(crate) points: Cow<'a, [Point3<f64>]>,
     /// One point per voxel.
     pub(crate) coarse: Vec<Point3<f64>>,
-    /// One point per half voxel, with normals and an index: what the polish aligns.
-    pub(crate) surface: IcpTarget,
+    /// One point per half voxel.
+    pub(crate) fine: Vec<Point3<f64>>,
     /// 3D keypoints with features.
     pub(crate) keypoints: PointFeatures,
 }
@@ -66,6 +68,7 @@ impl<'a> WorkingPair<'a> {
         // The two sides take turns, not threads: each step inside is parallel already.
         let (source_side, target_side) = (prepare(source, 0)?, prepare(target, 1)?);
         Ok(WorkingPair {
+            target_surface: surface(&target_side.fine, &scale)?,
             source: source_side,
             target: target_side,
             scale,
@@ -102,7 +105,7 @@ impl<'a> WorkingPair<'a> {
 
     /// How much of the source lies on the target under a pose, in metres.
     pub(crate) fn overlap(&self, target_from_source: &RigidTransform) -> Overlap {
-        let tree = self.target.surface.tree();
+        let tree = self.target_surface.tree();
         overlap(tree, &self.source.coarse, target_from_source, self.scale.voxel, self.unit)
     }
 
@@ -131,14 +134,14 @@ impl<'a> WorkingCloud<'a> {
     ) -> Result<WorkingCloud<'a>> {
         let points = in_units(scan.cloud.points(), unit);
         let coarse = voxel_downsample(&points, scale.voxel)?;
-        let surface = surface(&points, scale)?;
+        let fine = voxel_downsample(&points, scale.voxel / 2.0)?;
         let count = config.recipe.keypoints.unwrap_or(scale.keypoints);
         let mut random = Random::new(config.seed, stream);
         let keypoints = match &scan.features {
             Some(features) => sampled(features, scan.cloud.shift(), unit, count, &mut random),
             None => histograms(&coarse, scale, count, &mut random)?,
         };
-        Ok(WorkingCloud { points, coarse, surface, keypoints })
+        Ok(WorkingCloud { points, coarse, fine, keypoints })
     }
 
     /// Fast point feature histograms at `count` seeded voxel points.
@@ -160,12 +163,10 @@ fn in_units(points: &[Point3<f64>], unit: f64) -> Cow<'_, [Point3<f64>]> {
     }
 }
 
-/// Half-voxel points with normals from 30 neighbours within two voxels.
-fn surface(points: &[Point3<f64>], scale: &Scale) -> Result<IcpTarget> {
-    let fine = voxel_downsample(points, scale.voxel / 2.0)?;
-    let tree = KdTree::new(&fine);
-    let normals = estimate_normals(&fine, &tree, 2.0 * scale.voxel, 30);
-    IcpTarget::new(fine, normals)
+/// Normals from 30 neighbours within two voxels.
+fn surface(fine: &[Point3<f64>], scale: &Scale) -> Result<IcpTarget> {
+    let normals = estimate_normals(fine, &KdTree::new(fine), 2.0 * scale.voxel, 30);
+    IcpTarget::new(fine.to_vec(), normals)
 }
 
 /// The caller's keypoints in the working frame, at most `count` of them.
