@@ -89,6 +89,9 @@ pub fn fpfh_at(
     PointFeatures::new(asked, DIMENSION, values)
 }
 
+/// Marks points whose SPFH nobody asks for.
+const NOT_NEEDED: u32 = u32::MAX;
+
 /// A neighbour: its index and squared distance, square metres.
 type Item = (u32, f32);
 
@@ -116,40 +119,39 @@ impl Surface<'_> {
 
     /// The SPFH of every point in the neighbour lists of `indices`.
     fn simple_histograms(&self, indices: &[usize], lists: &[Box<[Item]>]) -> SimpleHistograms {
-        // Which points are needed, and which of them have a list already.
-        const NEEDED: u32 = u32::MAX - 1;
-        let mut slots = vec![SimpleHistograms::NONE; self.points.len()];
-        for &(neighbour, _) in lists.iter().flatten() {
-            slots[neighbour as usize] = NEEDED;
-        }
-        let mut listed = vec![None; 0];
-        let mut needed = Vec::new();
-        for (index, slot) in slots.iter_mut().enumerate() {
-            if *slot == NEEDED {
-                *slot = needed.len() as u32;
-                needed.push(index);
-            }
-        }
-        listed.resize(needed.len(), None);
+        let (needed, slots) = self.needed_points(lists);
+        // The asked ones among them have a list already.
+        let mut known: Vec<Option<&[Item]>> = vec![None; needed.len()];
         for (list, &index) in lists.iter().zip(indices) {
-            if let Some(entry) = listed.get_mut(slots[index] as usize) {
-                *entry = Some(list);
+            if let Some(known) = known.get_mut(slots[index] as usize) {
+                *known = Some(list);
             }
         }
-        let compute = |found: &mut Vec<Neighbour>,
-                       (&index, list): (&usize, &Option<&Box<[Item]>>)| {
-            match list {
-                Some(list) => self.simple(index, list.iter().map(|&(n, _)| n as usize)),
-                None => {
-                    self.neighbours(index, found);
-                    self.simple(index, found.iter().map(|n| n.index))
-                }
+        let compute = |found: &mut Vec<Neighbour>, (&index, known): (&usize, &Option<&[Item]>)| {
+            if let Some(list) = known {
+                return self.simple(index, list.iter().map(|&(neighbour, _)| neighbour as usize));
             }
+            self.neighbours(index, found);
+            self.simple(index, found.iter().map(|neighbour| neighbour.index))
         };
-        let histograms = (needed.par_iter().zip(&listed).with_min_len(CHUNK))
+        let histograms = (needed.par_iter().zip(&known).with_min_len(CHUNK))
             .map_init(Vec::new, compute)
             .collect();
         SimpleHistograms { slots, histograms }
+    }
+
+    /// The points in any of the lists, ascending, and for every point its position among them (or `NOT_NEEDED`).
+    fn needed_points(&self, lists: &[Box<[Item]>]) -> (Vec<usize>, Vec<u32>) {
+        let mut slots = vec![NOT_NEEDED; self.points.len()];
+        for &(neighbour, _) in lists.iter().flatten() {
+            slots[neighbour as usize] = 0;
+        }
+        let mut needed = Vec::new();
+        for (index, slot) in slots.iter_mut().enumerate().filter(|(_, slot)| **slot != NOT_NEEDED) {
+            *slot = needed.len() as u32;
+            needed.push(index);
+        }
+        (needed, slots)
     }
 
     /// The histogram of the angles between a point and its neighbours, which may include the point.
@@ -172,14 +174,12 @@ impl Surface<'_> {
 
 /// The SPFH of the points that are needed.
 struct SimpleHistograms {
-    /// Where each point's histogram stands, or [`SimpleHistograms::NONE`].
+    /// Where each point's histogram stands, or `NOT_NEEDED`.
     slots: Vec<u32>,
     histograms: Vec<Histogram>,
 }
 
 impl SimpleHistograms {
-    const NONE: u32 = u32::MAX;
-
     fn of(&self, index: usize) -> Option<&Histogram> {
         self.histograms.get(*self.slots.get(index)? as usize)
     }

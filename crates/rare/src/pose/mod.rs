@@ -3,6 +3,7 @@
 mod consensus;
 mod consistency;
 mod icp;
+mod icp_target;
 mod normal_equations;
 mod ransac;
 mod rigid_fit;
@@ -11,7 +12,8 @@ mod sc2_pcr;
 mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
-pub use icp::{Icp, IcpResult, IcpStage, IcpTarget};
+pub use icp::{Icp, IcpResult, IcpStage};
+pub use icp_target::IcpTarget;
 pub use ransac::Ransac;
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
