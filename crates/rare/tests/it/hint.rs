@@ -13,7 +13,7 @@ const PERCENTILES: f64 = 1e-6;
 const NORMALIZED_OFF: f64 = 0.001;
 const RESIZED_OFF: f64 = 0.06;
 /// Means of areas fall on halves, which `f32` and `f64` round to different sides.
-const RESIZED_OFF_EXACT: f64 = 0.005;
+const RESIZED_OFF_EXACT: f64 = 0.02;
 
 fn bytes(array: &Array) -> Vec<u8> {
     array.values.iter().map(|&value| value as u8).collect()
