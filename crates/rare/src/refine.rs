@@ -182,6 +182,9 @@ impl Refiner {
                 break;
             }
         }
+        if self.config.recipe.polish {
+            best = clock.time("polish", || hypotheses::finish(pair, &best, &verifier));
+        }
         let evidence = clock.time("verify", || self.evidence(pair, initial, &best, &sets));
         Ok(Refinement { timings: clock.into_timings(), ..evidence })
     }
@@ -229,7 +232,7 @@ impl Refiner {
             ));
         }
         let ranked = clock
-            .time("verify", || hypotheses::rank(&proposed.unwrap_or_default(), current, verifier));
+            .time("verify", || hypotheses::rank(&proposed.unwrap_or_default(), current, verifier, pair.scale.voxel));
         if !recipe.polish {
             return Ok(ranked.into_iter().next().unwrap_or(*current));
         }
@@ -248,8 +251,8 @@ impl Refiner {
 
     fn verifier<'a>(&self, pair: &'a WorkingPair<'_>, pose: &RigidTransform) -> Verifier<'a> {
         Verifier::new(
-            &pair.target.points,
-            &pair.source.points,
+            &pair.target.fine,
+            &pair.source.fine,
             &self.viewpoints(pair, pose),
             pair.scale.voxel,
         )
