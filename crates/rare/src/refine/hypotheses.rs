@@ -105,7 +105,11 @@ fn alike(a: &RigidTransform, b: &RigidTransform, voxel: f64) -> bool {
 }
 
 /// The best candidates moved onto the surface; of those and the unpolished ones, the most consistent.
-pub(super) fn polish(pair: &WorkingPair<'_>, ranked: &[Candidate], verifier: &Verifier<'_>) -> Candidate {
+pub(super) fn polish(
+    pair: &WorkingPair<'_>,
+    ranked: &[Candidate],
+    verifier: &Verifier<'_>,
+) -> Candidate {
     let icp = schedule(pair.scale.voxel, &[3.0, 1.5]);
     let polished = ranked.par_iter().take(POLISHED).filter_map(|candidate| {
         let start = &candidate.target_from_source;
@@ -119,9 +123,14 @@ pub(super) fn polish(pair: &WorkingPair<'_>, ranked: &[Candidate], verifier: &Ve
 }
 
 /// The winner moved onto the surface with all half-voxel points; kept unless it verifies worse.
-pub(super) fn finish(pair: &WorkingPair<'_>, best: &Candidate, verifier: &Verifier<'_>) -> Candidate {
+pub(super) fn finish(
+    pair: &WorkingPair<'_>,
+    best: &Candidate,
+    verifier: &Verifier<'_>,
+) -> Candidate {
     let icp = schedule(pair.scale.voxel, &[1.0]);
-    let Ok(aligned) = icp.align(&pair.source.fine, &pair.target_surface, &best.target_from_source) else {
+    let Ok(aligned) = icp.align(&pair.source.fine, &pair.target_surface, &best.target_from_source)
+    else {
         return *best;
     };
     let finished = Candidate::judged(aligned.target_from_source, verifier);

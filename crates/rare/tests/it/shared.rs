@@ -89,9 +89,7 @@ impl Golden {
             "<f4" => npy.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
             "<f8" => npy.into_vec::<f64>().unwrap(),
             "<i4" => npy.into_vec::<i32>().unwrap().into_iter().map(f64::from).collect(),
-            "<i8" => {
-                npy.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect()
-            }
+            "<i8" => npy.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect(),
             "|u1" => npy.into_vec::<u8>().unwrap().into_iter().map(f64::from).collect(),
             "|b1" => npy.into_vec::<bool>().unwrap().into_iter().map(f64::from).collect(),
             other => panic!("{name}: number type {other}"),
