@@ -36,8 +36,8 @@ Examples:
   rare refine a.ply b.ply --init 3dmatch.log:0,1 --source-features a.npz --reference-features b.npz
   rare refine a.ply b.ply --init coarse.txt --config indoor.toml --preset paper
 
-Feature files are NPZ archives of `points` (N x 3, metres) and `features` (N x D); correspondences are
-`source` and `reference` (N x 3, metres) and, if there is one, `score` (N).";
+Feature files are NPZ archives of `points` (N x 3, metres) and `features` (N x D).
+Correspondences are `source` and `reference` (N x 3, metres) and optionally `score` (N).";
 
 /// Register point clouds and refine given registrations, with a verdict on the result
 #[derive(Debug, Parser)]

@@ -7,8 +7,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, anyhow, bail};
-use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use rare::scale::Profile;
 use rare::viewpoints::CameraChoice;
 use rare::{InitialMethod, Recipe, RefinerConfig};

@@ -70,7 +70,8 @@ impl Serialize for Timings<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let steps = self.steps.iter().map(|timing| (timing.step.as_str(), timing.seconds));
         let ends = |name, seconds| std::iter::once((name, seconds));
-        serializer.collect_map(ends("read", self.read).chain(steps).chain(ends("total", self.total)))
+        serializer
+            .collect_map(ends("read", self.read).chain(steps).chain(ends("total", self.total)))
     }
 }
 

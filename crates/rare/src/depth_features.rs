@@ -135,7 +135,12 @@ impl DepthFeatures {
         }
     }
 
-    fn sample(&self, [x, y, z, depth]: [f32; CHANNELS], centre: f32, radius: f32) -> [f32; CHANNELS] {
+    fn sample(
+        &self,
+        [x, y, z, depth]: [f32; CHANNELS],
+        centre: f32,
+        radius: f32,
+    ) -> [f32; CHANNELS] {
         if depth <= 0.0 {
             return [0.0; CHANNELS];
         }

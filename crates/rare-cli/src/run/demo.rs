@@ -9,7 +9,7 @@ use rare::{RigidTransform, io as files};
 
 use crate::args::{Clouds, DemoArgs, Direction, Start};
 use crate::options::Options;
-use crate::run::{Registration, aligned, prepare, refine};
+use crate::run::{Registration, aligned, refine};
 use crate::summary;
 
 /// The colour of the source cloud.
@@ -17,8 +17,9 @@ const ORANGE: [u8; 3] = [230, 120, 20];
 /// The colour of the reference cloud.
 const BLUE: [u8; 3] = [40, 110, 200];
 
-pub(super) fn run(args: DemoArgs) -> Result<u8> {
+pub(super) fn run(args: &DemoArgs) -> Result<u8> {
     let folder = &args.output_dir;
+    fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
     let pair = demo_pair(args.seed)?;
     let (clouds, start) = write_inputs(folder, &pair)?;
     let settings = Options {
@@ -28,7 +29,6 @@ pub(super) fn run(args: DemoArgs) -> Result<u8> {
         ..Options::default()
     }
     .resolve()?;
-    prepare(&settings, &[&clouds.source, &clouds.reference, &start.init])?;
     let registration = refine::registration(&clouds, &start, settings)?;
     write_views(folder, &registration, &pair.initial)?;
     let code = registration.finish()?;
@@ -41,7 +41,6 @@ pub(super) fn run(args: DemoArgs) -> Result<u8> {
 
 /// Writes what `rare refine` needs, so that anybody can repeat the demo by hand.
 fn write_inputs(folder: &Path, pair: &ScanPair) -> Result<(Clouds, Start)> {
-    fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
     let clouds =
         Clouds { source: folder.join("source.ply"), reference: folder.join("reference.ply") };
     let init = folder.join("initial.txt");

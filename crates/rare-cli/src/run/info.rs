@@ -39,8 +39,9 @@ fn describe(file: &Path) -> Result<String> {
 /// Where the cloud lies, in the file's own coordinates.
 fn describe_place(text: &mut String, cloud: &PointCloud) {
     let (low, high) = cloud.bounds();
-    let triple =
-        |v: Vector3<f64>, between: &str| format!("{:.3}{between}{:.3}{between}{:.3}", v.x, v.y, v.z);
+    let triple = |v: Vector3<f64>, between: &str| {
+        format!("{:.3}{between}{:.3}{between}{:.3}", v.x, v.y, v.z)
+    };
     let (least, most) = (low.coords + cloud.shift(), high.coords + cloud.shift());
     row(text, "lowest", &format!("{} m", triple(least, " ")));
     row(text, "highest", &format!("{} m", triple(most, " ")));

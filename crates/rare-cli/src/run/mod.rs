@@ -27,7 +27,7 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
         Command::Refine(args) => refine::run(args),
         Command::Info(args) => info::run(&args),
         Command::Convert(args) => convert::run(&args),
-        Command::Demo(args) => demo::run(args),
+        Command::Demo(args) => demo::run(&args),
         Command::Completions(args) => completions::run(&args),
     }
 }
@@ -113,8 +113,8 @@ impl Registration {
     }
 }
 
-/// What can be done before any cloud is read: refuse outputs that must not be written, and start the threads.
-fn prepare(settings: &Settings, inputs: &[&Path]) -> Result<()> {
+/// Refuses outputs that must not be written, before any cloud is read.
+fn check_outputs(settings: &Settings, inputs: &[&Path]) -> Result<()> {
     let named = [
         ("--output", &settings.output),
         ("--json", &settings.json),
@@ -122,16 +122,17 @@ fn prepare(settings: &Settings, inputs: &[&Path]) -> Result<()> {
     ];
     let output = |(option, path): (_, _)| Some(Output { option, path: Option::as_deref(path)? });
     let outputs: Vec<Output<'_>> = named.into_iter().filter_map(output).collect();
-    let read: Vec<&Path> = inputs
-        .iter()
-        .copied()
-        .chain(settings.config.as_deref())
-        .chain(settings.depth_features.as_deref())
-        .collect();
+    let configured = [&settings.config, &settings.depth_features];
+    let configured = configured.into_iter().filter_map(Option::as_deref);
+    let read: Vec<&Path> = inputs.iter().copied().chain(configured).collect();
     outputs::check(&read, &outputs)?;
-    if let Some(file) = &settings.save_aligned {
-        files::check_writable_format(file).context("--save-aligned")?;
+    match &settings.save_aligned {
+        Some(file) => files::check_writable_format(file).context("--save-aligned"),
+        None => Ok(()),
     }
+}
+
+fn start_threads(settings: &Settings) -> Result<()> {
     rayon::ThreadPoolBuilder::new()
         .num_threads(settings.threads)
         .build_global()

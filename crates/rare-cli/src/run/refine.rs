@@ -9,11 +9,12 @@ use rare::{Correspondence, Refinement, Refiner, RigidTransform, Scan, io as file
 use crate::args::{Clouds, Direction, RefineArgs, Start};
 use crate::options::Settings;
 use crate::progress::Progress;
-use crate::run::{Inputs, Registration, prepare, read_scan, which};
+use crate::run::{Inputs, Registration, check_outputs, read_scan, start_threads, which};
 
 pub(super) fn run(args: RefineArgs) -> Result<u8> {
     let settings = args.options.resolve()?;
-    prepare(&settings, &inputs(&args.clouds, &args.start))?;
+    check_outputs(&settings, &inputs(&args.clouds, &args.start))?;
+    start_threads(&settings)?;
     registration(&args.clouds, &args.start, settings)?.finish()
 }
 

@@ -8,7 +8,7 @@ use rare::Refiner;
 use crate::args::{Clouds, RegisterArgs};
 use crate::options::{Options, Settings};
 use crate::progress::Progress;
-use crate::run::{Inputs, Registration, Start, prepare, read_scan, which};
+use crate::run::{Inputs, Registration, Start, check_outputs, read_scan, start_threads, which};
 
 pub(super) fn run(args: RegisterArgs) -> Result<u8> {
     let options = Options { init_method: args.init_method, ..args.options };
@@ -19,7 +19,8 @@ pub(super) fn run(args: RegisterArgs) -> Result<u8> {
             file.display()
         );
     }
-    prepare(&settings, &[&args.clouds.source, &args.clouds.reference])?;
+    check_outputs(&settings, &[&args.clouds.source, &args.clouds.reference])?;
+    start_threads(&settings)?;
     registration(&args.clouds, settings)?.finish()
 }
 
