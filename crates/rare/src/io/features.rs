@@ -1,13 +1,15 @@
 //! Features and correspondences of other programs, as NPZ archives.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
-use nalgebra::Point3;
+use nalgebra::{Matrix4, Point3};
 
 use super::npy::Array;
 use super::npz::{self, Entry, NpzFile};
 use super::whole_file::write_whole;
 use crate::data::{Correspondence, PointFeatures};
+use crate::encode::Recorded;
 use crate::error::{Error, Result};
 
 /// Reads points with a feature vector each: an NPZ archive of `points` (`N x 3`, metres, in the cloud's frame) and
@@ -53,6 +55,27 @@ pub fn write_point_features(path: impl AsRef<Path>, features: &PointFeatures) ->
         },
     ];
     write_whole(path, |writer| npz::write(writer, &entries))
+}
+
+/// Reads the features of depth maps that another program computed: an NPZ archive of the arrays that
+/// [`Recorded::from_arrays`] takes (`initial`, `refview_ref_layer0`, ...).
+///
+/// # Errors
+/// `Io` if the file cannot be read, `InvalidInput` if an array is missing, unknown, or has another shape.
+pub fn read_depth_features(path: impl AsRef<Path>) -> Result<Recorded> {
+    let path = path.as_ref();
+    let mut file = NpzFile::open(path)?;
+    let initial = file.array_f64("initial")?;
+    if initial.shape != [4, 4] {
+        return Err(shape_error(path, "initial", "4 x 4", &initial.shape));
+    }
+    let mut arrays = BTreeMap::new();
+    for name in file.names().into_iter().filter(|name| name != "initial") {
+        let array = file.array_f32(&name)?;
+        arrays.insert(name, (array.shape, array.values));
+    }
+    Recorded::from_arrays(&Matrix4::from_row_slice(&initial.values), arrays)
+        .map_err(|error| super::name_file(path, error))
 }
 
 /// Reads correspondences: an NPZ archive of `source` and `reference` (`N x 3`, metres, each in its cloud's frame) and,

@@ -32,12 +32,15 @@ mod text;
 mod whole_file;
 mod xyz;
 
-use std::io::{self, Write};
+use std::fs::File;
+use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use nalgebra::Point3;
 
-pub use self::features::{read_correspondences, read_point_features, write_point_features};
+pub use self::features::{
+    read_correspondences, read_depth_features, read_point_features, write_point_features,
+};
 pub use self::npy::Array;
 pub use self::npz::NpzFile;
 pub use self::pose::{format_pose, read_pose, write_pose};
@@ -94,6 +97,29 @@ fn read_npz(path: &Path, bytes: Vec<u8>, name: Option<String>) -> Result<Vec<Poi
     archive.points(&name)
 }
 
+/// The name of the format in which [`read_cloud`] would read a file, for example `PLY`.
+///
+/// # Errors
+/// `Io` if the file cannot be opened, otherwise as [`read_cloud`] where no format fits.
+pub fn cloud_format(path: impl AsRef<Path>) -> Result<&'static str> {
+    /// More than any format's mark needs.
+    const LOOKED_AT: u64 = 4096;
+    let (file, _) = split_selector(path.as_ref(), "npz");
+    let mut start = Vec::new();
+    File::open(&file)
+        .and_then(|opened| opened.take(LOOKED_AT).read_to_end(&mut start))
+        .map_err(|error| Error::io(&file, error))?;
+    Format::of(&file, &start).map(Format::name)
+}
+
+/// Makes sure that [`write_cloud`] knows the format of the extension, before there is anything to write.
+///
+/// # Errors
+/// `Unsupported` for an extension that is not written.
+pub fn check_writable_format(path: impl AsRef<Path>) -> Result<()> {
+    writer_of(path.as_ref()).map(|_| ())
+}
+
 /// Writes points in the format of the extension: `.ply` and `.pcd` (binary, in single precision where that keeps
 /// 0.1 mm within 10 km of the origin, otherwise double), `.xyz` (text that reads back exactly) or `.npy` (64-bit
 /// `N x 3`).
@@ -102,23 +128,27 @@ fn read_npz(path: &Path, bytes: Vec<u8>, name: Option<String>) -> Result<Vec<Poi
 /// `Unsupported` for another extension, `InvalidInput` if there is no point, otherwise those of [`write_whole`].
 pub fn write_cloud(path: impl AsRef<Path>, points: &[Point3<f64>]) -> Result<()> {
     let path = path.as_ref();
-    let write: fn(&mut dyn Write, &[Point3<f64>]) -> io::Result<()> = match extension(path).as_str()
-    {
-        "ply" => ply::write,
-        "pcd" => pcd::write,
-        "xyz" => xyz::write,
-        "npy" => npy::write,
-        _ => {
-            return Err(Error::Unsupported(format!(
-                "{}: a cloud is not written in this format: choose one of {WRITABLE}",
-                path.display()
-            )));
-        }
-    };
+    let write = writer_of(path)?;
     if points.is_empty() {
         return Err(Error::in_file(path, "there is no point to write"));
     }
     write_whole(path, |writer| write(writer, points))
+}
+
+/// Writes points to somewhere.
+type CloudWriter = fn(&mut dyn Write, &[Point3<f64>]) -> io::Result<()>;
+
+fn writer_of(path: &Path) -> Result<CloudWriter> {
+    match extension(path).as_str() {
+        "ply" => Ok(ply::write),
+        "pcd" => Ok(pcd::write),
+        "xyz" => Ok(xyz::write),
+        "npy" => Ok(npy::write),
+        _ => Err(Error::Unsupported(format!(
+            "{}: a cloud is not written in this format: choose one of {WRITABLE}",
+            path.display()
+        ))),
+    }
 }
 
 /// Writes several clouds into one binary PLY file, each in its colour (red, green, blue), to look at how they fit.
@@ -158,6 +188,19 @@ impl Format {
                 "{}: .{other} is not a format that is read: convert it to one of {READABLE}",
                 path.display()
             ))),
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Format::Ply => "PLY",
+            Format::Pcd => "PCD",
+            Format::Text => "text",
+            Format::Npy => "NPY",
+            Format::Npz => "NPZ",
+            Format::KittiBin => "KITTI binary",
+            Format::Las => "LAS or LAZ",
+            Format::E57 => "E57",
         }
     }
 

@@ -1,0 +1,163 @@
+//! What was typed.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap_complete::Shell;
+use rare::InitialMethod;
+use serde::Serialize;
+
+use crate::options::{Options, choice};
+
+const EXAMPLES: &str = "\
+Examples:
+  rare demo
+  rare register scan1.ply scan2.ply
+  rare refine scan1.ply scan2.ply --init coarse.txt --output refined.txt --json evidence.json
+
+The transform is printed as 4 lines of 4 numbers. It moves points of SRC into the frame of REF.
+Coordinates are metres; angles are degrees.
+
+Exit codes:
+  0  the transform passed verification
+  1  no transform can be trusted (a best guess is still written if there is one)
+  2  the input or the options cannot be used";
+
+const REGISTER_EXAMPLES: &str = "\
+Examples:
+  rare register scan1.ply scan2.ply > transform.txt
+  rare register scan1.pcd scan2.pcd --save-aligned moved.ply --json evidence.json
+  rare register 000000.bin 000010.bin --profile lidar";
+
+const REFINE_EXAMPLES: &str = "\
+Examples:
+  rare refine scan1.ply scan2.ply --init coarse.txt > transform.txt
+  rare refine a.ply b.ply --init b_to_a.txt --init-direction target-to-source
+  rare refine a.ply b.ply --init 3dmatch.log:0,1 --source-features a.npz --reference-features b.npz
+  rare refine a.ply b.ply --init coarse.txt --config indoor.toml --preset paper
+
+Feature files are NPZ archives of `points` (N x 3, metres) and `features` (N x D).
+Correspondences are `source` and `reference` (N x 3, metres) and optionally `score` (N).";
+
+/// Register point clouds and refine given registrations, with a verdict on the result
+#[derive(Debug, Parser)]
+#[command(name = "rare", version, after_help = EXAMPLES)]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Register two clouds of which nothing is known
+    Register(RegisterArgs),
+    /// Refine a given transform between two clouds
+    Refine(RefineArgs),
+    /// Say what is in cloud files, and which lengths would be used for them
+    Info(InfoArgs),
+    /// Write a cloud in another format
+    Convert(ConvertArgs),
+    /// Simulate two scans of a room, register them from a wrong start and compare with the truth
+    Demo(DemoArgs),
+    /// Print the completion script of a shell
+    Completions(CompletionsArgs),
+}
+
+/// The two clouds.
+#[derive(Debug, Args)]
+pub(crate) struct Clouds {
+    /// The source: the cloud that is moved (.ply .pcd .xyz .npy .npz .bin .las .laz .e57; metres)
+    #[arg(value_name = "SRC")]
+    pub(crate) source: PathBuf,
+    /// The reference (target): the cloud that stays; the transform leads from SRC to its frame
+    #[arg(value_name = "REF")]
+    pub(crate) reference: PathBuf,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = REGISTER_EXAMPLES)]
+pub(crate) struct RegisterArgs {
+    #[command(flatten)]
+    pub(crate) clouds: Clouds,
+    /// How the initial transform is estimated [default: sc2-pcr]
+    #[arg(long, value_name = "METHOD", value_parser = choice::<InitialMethod>(&["ransac", "sc2-pcr"]))]
+    pub(crate) init_method: Option<InitialMethod>,
+    #[command(flatten)]
+    pub(crate) options: Options,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = REFINE_EXAMPLES)]
+pub(crate) struct RefineArgs {
+    #[command(flatten)]
+    pub(crate) clouds: Clouds,
+    #[command(flatten)]
+    pub(crate) start: Start,
+    #[command(flatten)]
+    pub(crate) options: Options,
+}
+
+/// What is refined.
+#[derive(Debug, Args)]
+pub(crate) struct Start {
+    /// The initial transform: 4 x 4 text or NPY, a TUM line, a 3DMatch log (FILE.log:i,j), or JSON of this program
+    #[arg(long, value_name = "FILE")]
+    pub(crate) init: PathBuf,
+    /// The direction in which the file holds it; source-to-target moves points of SRC into the frame of REF
+    #[arg(long, value_name = "DIRECTION", value_enum, default_value_t = Direction::SourceToTarget)]
+    pub(crate) init_direction: Direction,
+    /// 3D keypoints of SRC with features (NPZ) in the place of the built-in ones
+    #[arg(long, value_name = "FILE", requires = "reference_features")]
+    pub(crate) source_features: Option<PathBuf>,
+    /// 3D keypoints of REF with features (NPZ)
+    #[arg(long, value_name = "FILE", requires = "source_features")]
+    pub(crate) reference_features: Option<PathBuf>,
+    /// Correspondences of another method (NPZ) in the place of matches of 3D features
+    #[arg(long, value_name = "FILE", conflicts_with = "source_features")]
+    pub(crate) correspondences: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(crate) enum Direction {
+    /// It moves points of SRC into the frame of REF
+    SourceToTarget,
+    /// It moves points of REF into the frame of SRC
+    TargetToSource,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct InfoArgs {
+    /// The files
+    #[arg(value_name = "CLOUD", required = true)]
+    pub(crate) clouds: Vec<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ConvertArgs {
+    /// The cloud to read (.ply .pcd .xyz .npy .npz .bin .las .laz .e57)
+    #[arg(value_name = "IN")]
+    pub(crate) input: PathBuf,
+    /// The file to write (.ply .pcd .xyz .npy); only the coordinates are kept
+    #[arg(value_name = "OUT")]
+    pub(crate) output: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DemoArgs {
+    /// The folder for clouds and results; made if it does not exist
+    #[arg(long, value_name = "DIR", default_value = "rare-demo")]
+    pub(crate) output_dir: PathBuf,
+    /// Which room is simulated
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) seed: u64,
+    /// Print nothing but the transform and errors
+    #[arg(short, long)]
+    pub(crate) quiet: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct CompletionsArgs {
+    /// The shell
+    pub(crate) shell: Shell,
+}

@@ -1,0 +1,121 @@
+//! `rare refine`: two clouds and an initial transform.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, Result};
+use rare::{Correspondence, Refinement, Refiner, RigidTransform, Scan, io as files};
+
+use crate::args::{Clouds, Direction, RefineArgs, Start};
+use crate::options::Settings;
+use crate::progress::Progress;
+use crate::run::{Inputs, Registration, check_outputs, read_scan, start_threads, which};
+
+pub(super) fn run(args: RefineArgs) -> Result<u8> {
+    let settings = args.options.resolve()?;
+    check_outputs(&settings, &inputs(&args.clouds, &args.start))?;
+    start_threads(&settings)?;
+    registration(&args.clouds, &args.start, settings)?.finish()
+}
+
+/// All files that are read.
+fn inputs<'a>(clouds: &'a Clouds, start: &'a Start) -> Vec<&'a Path> {
+    let optional = [&start.source_features, &start.reference_features, &start.correspondences];
+    [&clouds.source, &clouds.reference, &start.init]
+        .into_iter()
+        .chain(optional.into_iter().flatten())
+        .map(PathBuf::as_path)
+        .collect()
+}
+
+/// Everything that was read.
+struct Problem {
+    source: Scan,
+    reference: Scan,
+    initial: RigidTransform,
+    correspondences: Option<Vec<Correspondence>>,
+    refiner: Refiner,
+}
+
+pub(super) fn registration(
+    clouds: &Clouds,
+    start: &Start,
+    settings: Settings,
+) -> Result<Registration> {
+    let clock = Instant::now();
+    let progress = Progress::start(settings.quiet);
+    progress.step("read");
+    let mut problem = read(clouds, start, &settings)?;
+    let read_seconds = clock.elapsed().as_secs_f64();
+    problem.refiner = problem.refiner.with_progress(progress.callback());
+    let refinement = problem.solve().with_context(|| which(clouds))?;
+    Ok(Registration {
+        settings,
+        inputs: named(clouds, start),
+        source: problem.source,
+        reference: problem.reference,
+        initial: Some(problem.initial),
+        refinement,
+        read_seconds,
+        total_seconds: clock.elapsed().as_secs_f64(),
+    })
+}
+
+fn read(clouds: &Clouds, start: &Start, settings: &Settings) -> Result<Problem> {
+    // The small files first: what is wrong with them need not wait for the clouds.
+    let initial = read_initial(start)?;
+    let mut refiner = Refiner::new(settings.refiner.clone());
+    if let Some(file) = &settings.depth_features {
+        let recorded = files::read_depth_features(file)?;
+        recorded.check_initial(&initial).with_context(|| file.display().to_string())?;
+        refiner = refiner.with_encoder(Box::new(recorded));
+    }
+    let features = |file: &Option<PathBuf>| -> rare::Result<_> {
+        file.as_ref().map(files::read_point_features).transpose()
+    };
+    let source_features = features(&start.source_features)?;
+    let reference_features = features(&start.reference_features)?;
+    let correspondences =
+        start.correspondences.as_ref().map(files::read_correspondences).transpose()?;
+    Ok(Problem {
+        source: Scan { features: source_features, ..read_scan(&clouds.source)? },
+        reference: Scan { features: reference_features, ..read_scan(&clouds.reference)? },
+        initial,
+        correspondences,
+        refiner,
+    })
+}
+
+/// The initial transform from source to reference.
+fn read_initial(start: &Start) -> Result<RigidTransform> {
+    let given = files::read_pose(&start.init)?;
+    Ok(match start.init_direction {
+        Direction::SourceToTarget => given,
+        Direction::TargetToSource => given.inverse(),
+    })
+}
+
+impl Problem {
+    fn solve(&self) -> rare::Result<Refinement> {
+        let Problem { source, reference, initial, .. } = self;
+        match &self.correspondences {
+            Some(pairs) => self.refiner.refine_matched(source, reference, initial, pairs),
+            None => self.refiner.refine(source, reference, initial),
+        }
+    }
+}
+
+fn named(clouds: &Clouds, start: &Start) -> Inputs {
+    let name = |file: &PathBuf| file.display().to_string();
+    Inputs {
+        source: name(&clouds.source),
+        reference: name(&clouds.reference),
+        start: super::Start::Given {
+            init: name(&start.init),
+            init_direction: start.init_direction,
+            source_features: start.source_features.as_ref().map(name),
+            reference_features: start.reference_features.as_ref().map(name),
+            correspondences: start.correspondences.as_ref().map(name),
+        },
+    }
+}
