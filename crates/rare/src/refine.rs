@@ -182,6 +182,9 @@ impl Refiner {
                 break;
             }
         }
+        if self.config.recipe.polish {
+            best = clock.time("polish", || hypotheses::finish(pair, &best, &verifier));
+        }
         let evidence = clock.time("verify", || self.evidence(pair, initial, &best, &sets));
         Ok(Refinement { timings: clock.into_timings(), ..evidence })
     }
@@ -228,8 +231,9 @@ impl Refiner {
                 verifier,
             ));
         }
-        let ranked = clock
-            .time("verify", || hypotheses::rank(&proposed.unwrap_or_default(), current, verifier));
+        let ranked = clock.time("verify", || {
+            hypotheses::rank(&proposed.unwrap_or_default(), current, verifier, pair.scale.voxel)
+        });
         if !recipe.polish {
             return Ok(ranked.into_iter().next().unwrap_or(*current));
         }
@@ -248,8 +252,8 @@ impl Refiner {
 
     fn verifier<'a>(&self, pair: &'a WorkingPair<'_>, pose: &RigidTransform) -> Verifier<'a> {
         Verifier::new(
-            &pair.target.points,
-            &pair.source.points,
+            &pair.target.fine,
+            &pair.source.fine,
             &self.viewpoints(pair, pose),
             pair.scale.voxel,
         )
@@ -293,14 +297,17 @@ impl Refiner {
         };
         let sets: Vec<SetEvidence> = sets.sets.iter().map(of_set).collect();
         let overlap = pair.overlap(pose);
-        let confidence = confidence(&best.consistency, overlap.share);
+        let inliers: usize = sets.iter().map(|set| set.inliers).sum();
+        let correspondences: usize = sets.iter().map(|set| set.correspondences).sum();
+        let inlier_ratio = inliers as f64 / correspondences.max(1) as f64;
+        let confidence = confidence(best.consistency.agreement(), overlap.share, inlier_ratio);
         Refinement {
             target_from_source: pair.to_world(pose),
             verdict: Verdict::of(confidence, pose == initial),
             confidence,
             overlap: overlap.share,
-            inliers: sets.iter().map(|set| set.inliers).sum(),
-            correspondences: sets.iter().map(|set| set.correspondences).sum(),
+            inliers,
+            correspondences,
             sets,
             consistency: best.consistency,
             information: overlap.information,

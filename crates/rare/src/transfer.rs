@@ -92,7 +92,7 @@ pub fn lift(map: &FeatureMap, depth: &DepthMap, range: DepthRange, sampling: Sam
         }
         match sampling {
             Sampling::OwnCell => {
-                feature.copy_from_slice(&values[cell * map.channels()..][..map.channels()])
+                feature.copy_from_slice(&values[cell * map.channels()..][..map.channels()]);
             }
             Sampling::AlignedCorners => {
                 let x = Tap::new(u, width, map.width());

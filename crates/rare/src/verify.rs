@@ -226,10 +226,13 @@ impl Verdict {
     }
 }
 
-/// How believable a pose is, 0 to 1: a logistic function of the share of comparable pixels that agree and of the
-/// overlap.
+/// How believable a pose is, 0 to 1: a logistic function of the share of comparable pixels that agree, of the overlap
+/// and of the share of the correspondences that agree (each 0 to 1).
+///
+/// The coefficients were fitted by ridge regression to the results of the default preset on the development pairs (see
+/// `docs/measurements.md`); it is a first model, for ranking and for refusing what is clearly wrong.
 #[must_use]
-pub fn confidence(consistency: &DepthConsistency, overlap: f64) -> f64 {
-    let evidence = -6.0 + 8.0 * consistency.agreement() + 10.0 * overlap;
+pub fn confidence(agreement: f64, overlap: f64, inlier_ratio: f64) -> f64 {
+    let evidence = -6.76 + 4.66 * agreement + 10.03 * overlap + 5.56 * inlier_ratio;
     1.0 / (1.0 + (-evidence).exp())
 }

@@ -270,4 +270,11 @@ mod tests {
             prop_assert_eq!(pair_bins(&d, &n1, &n2), pair_bins(&-d, &n2, &n1));
         }
     }
+
+    #[test]
+    fn opposite_normals_fall_on_the_side_that_the_sign_of_zero_says() {
+        // atan2(-0, -1) = -pi, atan2(0, -1) = pi
+        assert_eq!((angle_bin(-0.0, -1.0), angle_bin(0.0, -1.0)), (0, BINS - 1));
+        assert_eq!((angle_bin(-0.0, 1.0), angle_bin(0.0, 1.0)), (BINS / 2, BINS / 2));
+    }
 }

@@ -168,4 +168,14 @@ mod tests {
             estimate_normals(&same, &KdTree::new(&same), 1.0, 30).iter().all(|n| n.norm() == 0.0)
         );
     }
+
+    #[test]
+    fn a_point_off_its_surface_takes_the_normal_of_the_surface() {
+        let mut points: Vec<Point3<f64>> = (0..441)
+            .map(|i| Point3::new(f64::from(i % 21 - 10), f64::from(i / 21 - 10), 0.0) * 0.02)
+            .collect();
+        points.push(Point3::new(0.0, 0.0, 0.15));
+        let normals = estimate_normals(&points, &KdTree::new(&points), 0.25, 1000);
+        assert!(normals[441].z.abs() > 0.999, "{}", normals[441]);
+    }
 }

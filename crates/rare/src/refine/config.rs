@@ -64,7 +64,7 @@ impl Default for Recipe {
     fn default() -> Recipe {
         Recipe {
             metric: false,
-            rounds: 3,
+            rounds: 2,
             components: None,
             aligned_corners: false,
             consensus: true,

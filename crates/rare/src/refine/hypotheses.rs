@@ -19,7 +19,7 @@ pub(super) struct Candidate {
 }
 
 /// Candidates that are polished, besides the current one.
-const POLISHED: usize = 3;
+const POLISHED: usize = 2;
 /// Hypotheses taken from each set.
 const HYPOTHESES_PER_SET: usize = 2;
 /// Most pairs of a set in which consensus is sought; the best-scored ones.
@@ -78,16 +78,30 @@ fn keep_best_scored(pairs: &mut Vec<Correspondence>, count: usize) {
     pairs.truncate(count);
 }
 
-/// Step 9: all hypotheses and the current pose, the most consistent first; of equals the current one, then the earlier.
+/// Step 9: all different hypotheses and the current pose, the most consistent first; of equals the current one, then
+/// the earlier. Of hypotheses that are almost the same the first is kept.
 pub(super) fn rank(
     proposed: &[RigidTransform],
     current: &Candidate,
     verifier: &Verifier<'_>,
+    voxel: f64,
 ) -> Vec<Candidate> {
-    let judged = proposed.iter().map(|pose| Candidate::judged(*pose, verifier));
+    let mut different: Vec<RigidTransform> = Vec::new();
+    for pose in proposed {
+        if !different.iter().any(|other| alike(pose, other, voxel)) {
+            different.push(*pose);
+        }
+    }
+    let judged = different.iter().map(|pose| Candidate::judged(*pose, verifier));
     let mut ranked: Vec<Candidate> = std::iter::once(*current).chain(judged).collect();
     ranked.sort_by(|a, b| b.consistency.score().total_cmp(&a.consistency.score()));
     ranked
+}
+
+/// Whether two poses would be polished into the same one: less than 1 degree and half a voxel apart.
+fn alike(a: &RigidTransform, b: &RigidTransform, voxel: f64) -> bool {
+    let difference = a.error_to(b);
+    difference.rotation_degrees < 1.0 && difference.translation < 0.5 * voxel
 }
 
 /// The best candidates moved onto the surface; of those and the unpolished ones, the most consistent.
@@ -96,11 +110,10 @@ pub(super) fn polish(
     ranked: &[Candidate],
     verifier: &Verifier<'_>,
 ) -> Candidate {
-    let icp = polish_schedule(pair.scale.voxel);
+    let icp = schedule(pair.scale.voxel, &[3.0, 1.5]);
     let polished = ranked.par_iter().take(POLISHED).filter_map(|candidate| {
-        let aligned = icp
-            .align(&pair.source.coarse, &pair.target_surface, &candidate.target_from_source)
-            .ok()?;
+        let start = &candidate.target_from_source;
+        let aligned = icp.align(&pair.source.coarse, &pair.target_surface, start).ok()?;
         Some(Candidate::judged(aligned.target_from_source, verifier))
     });
     let mut all: Vec<Candidate> = polished.collect();
@@ -109,13 +122,27 @@ pub(super) fn polish(
     all[0]
 }
 
-/// Tukey point-to-plane within three voxels, then one and a half: 15 cm and 7.5 cm indoors.
-fn polish_schedule(voxel: f64) -> Icp {
-    let stage =
-        |voxels: f64| IcpStage { max_distance: voxels * voxel, kernel_width: voxels * voxel };
+/// The winner moved onto the surface with all half-voxel points; kept unless it verifies worse.
+pub(super) fn finish(
+    pair: &WorkingPair<'_>,
+    best: &Candidate,
+    verifier: &Verifier<'_>,
+) -> Candidate {
+    let icp = schedule(pair.scale.voxel, &[1.0]);
+    let Ok(aligned) = icp.align(&pair.source.fine, &pair.target_surface, &best.target_from_source)
+    else {
+        return *best;
+    };
+    let finished = Candidate::judged(aligned.target_from_source, verifier);
+    if finished.consistency.score() >= best.consistency.score() { finished } else { *best }
+}
+
+/// Tukey point-to-plane within a few voxels, coarse to fine.
+fn schedule(voxel: f64, reaches: &[f64]) -> Icp {
+    let stage = |reach: &f64| IcpStage { max_distance: reach * voxel, kernel_width: reach * voxel };
     Icp {
         kernel: RobustKernel::Tukey,
-        stages: vec![stage(3.0), stage(1.5)],
+        stages: reaches.iter().map(stage).collect(),
         max_iterations: 15,
         rotation_tolerance: 5e-4,
         translation_tolerance: 0.01 * voxel,

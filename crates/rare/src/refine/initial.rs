@@ -49,7 +49,7 @@ pub(super) fn estimate(
             let poses: Vec<RigidTransform> =
                 estimates.iter().map(|estimate| estimate.target_from_source).collect();
             let first = Candidate::judged(poses[0], verifier);
-            Ok(rank(&poses[1..], &first, verifier)[0].target_from_source)
+            Ok(rank(&poses[1..], &first, verifier, pair.scale.voxel)[0].target_from_source)
         }
     }
 }

@@ -189,6 +189,7 @@ fn every_kind_of_bad_cloud_is_named_with_its_remedy() {
         ("cut.bin", cut("scan.bin", 799), "16 bytes per point"),
         ("cut.las", cut("old.las", 1500), "promises 50 points"),
         ("cut.laz", cut("old.laz", 400), "the LAZ data are damaged"),
+        ("many.laz", patched("old.laz", 107, &1_000_000u32.to_le_bytes()), "1000000 points of 34 bytes"),
         ("cut.e57", cut("two_scans.e57", 6000), "E57 file is damaged"),
         ("text.bin", b"0.25 0.5 0.75 1\n".to_vec(), "name it .xyz"),
         ("bad.ply", altered("text.ply", "-4.5", "x4.5"), "line 22, column 3: \"x4.5\""),
@@ -282,7 +283,7 @@ fn constant_scan() -> Vec<u8> {
 /// A 64-bit end of the directory that claims as many entries as the file has bytes.
 fn entries_lie() -> Vec<u8> {
     let mut bytes = b"PK\x03\x04".to_vec();
-    bytes.resize(1 << 20, 0);
+    bytes.resize(4 << 20, 0);
     let end = bytes.len() as u64;
     bytes.extend(b"PK\x06\x06");
     bytes.extend([44, 0, 0, 0, 0, 0, 0, 0, 45, 0, 45, 0, 0, 0, 0, 0, 0, 0, 0, 0]);

@@ -29,14 +29,17 @@ fn the_budget_is_kept_and_reported() {
 
 #[test]
 fn neither_threads_nor_runs_show_but_the_seed_does() {
-    let pairs = synthetic(500, 0.06, &motion(), 8);
-    let run = |threads, seed| {
+    let run = |threads, seed, pairs: &[_]| {
         let settings = Ransac { seed, polish_rounds: 0, ..Ransac::for_voxel(0.05) };
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| estimate(&settings, &pairs))
+        pool.install(|| estimate(&settings, pairs))
     };
-    assert_eq!(run(1, 0), run(2, 0));
-    assert_ne!(run(1, 0).target_from_source, run(1, 1).target_from_source);
+    // The stopping rule looks at different times for each share.
+    for share in [0.06, 0.08, 0.1, 0.12, 0.15, 0.2] {
+        let pairs = synthetic(500, share, &motion(), 8);
+        assert_eq!(run(1, 0, &pairs), run(2, 0, &pairs));
+        assert_ne!(run(1, 0, &pairs).target_from_source, run(1, 1, &pairs).target_from_source);
+    }
 }
 
 #[test]
