@@ -22,7 +22,8 @@ pub(crate) struct Progress {
 impl Progress {
     /// Shows nothing if `quiet`, or if stderr is no terminal.
     pub(crate) fn start(quiet: bool) -> Progress {
-        let spinner = ProgressBar::with_draw_target(None, ProgressDrawTarget::hidden());
+        let spinner = ProgressBar::new_spinner();
+        spinner.set_draw_target(ProgressDrawTarget::hidden());
         let shown = !quiet && io::stderr().is_terminal();
         let waiting = shown.then(|| {
             let (sender, receiver) = mpsc::channel();

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 use std::io::{self, Write as _};
 
+use rare::scale::SceneKind;
 use rare::verify::Verdict;
 use rare::{PointCloud, Refinement, RigidTransform};
 
@@ -74,9 +75,15 @@ pub(crate) fn describe_details(refinement: &Refinement) -> String {
     for timing in &refinement.timings {
         row(&mut text, &timing.step, &format!("{:.3} s", timing.seconds));
     }
-    let scale = &refinement.scale;
-    let _ = writeln!(text, "voxel size {:.4} m, a scene of the kind {:?}", scale.voxel, scale.kind);
+    text.push_str("decided from the clouds\n");
+    row(&mut text, "scene", &kind_in_words(refinement.scale.kind));
+    row(&mut text, "voxel", &format!("{:.4} m", refinement.scale.voxel));
     text.trim_end().to_owned()
+}
+
+/// The kind of scene as options name it.
+pub(crate) fn kind_in_words(kind: SceneKind) -> String {
+    format!("{kind:?}").to_lowercase()
 }
 
 /// A name and its value, in columns.

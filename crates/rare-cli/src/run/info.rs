@@ -11,7 +11,7 @@ use rare::{PointCloud, io as files};
 use crate::SUCCESS;
 use crate::args::InfoArgs;
 use crate::run::print;
-use crate::summary::row;
+use crate::summary::{kind_in_words, row};
 
 pub(super) fn run(args: &InfoArgs) -> Result<u8> {
     let texts = args.clouds.iter().map(|file| describe(file)).collect::<Result<Vec<String>>>()?;
@@ -20,10 +20,9 @@ pub(super) fn run(args: &InfoArgs) -> Result<u8> {
 }
 
 fn describe(file: &Path) -> Result<String> {
-    let format = files::cloud_format(file)?;
     let cloud = files::read_cloud(file)?;
     let mut text = format!("{}\n", file.display());
-    row(&mut text, "format", format);
+    row(&mut text, "format", files::cloud_format(file)?);
     row(&mut text, "points", &cloud.len().to_string());
     row(&mut text, "dropped", &format!("{} (not finite)", cloud.dropped()));
     describe_place(&mut text, &cloud);
@@ -31,7 +30,7 @@ fn describe(file: &Path) -> Result<String> {
     // A cloud without extent has no scale, but everything above.
     let scale = Scale::new(Profile::Auto, None, &cloud, &cloud)
         .with_context(|| file.display().to_string())?;
-    row(&mut text, "scene", &format!("{:?}", scale.kind).to_lowercase());
+    row(&mut text, "scene", &kind_in_words(scale.kind));
     row(&mut text, "voxel", &format!("{} m (automatic)", scale.voxel));
     Ok(text)
 }
