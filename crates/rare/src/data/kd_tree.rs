@@ -5,10 +5,11 @@
 //! One traversal serves all queries: it offers every point that precedes a shrinking bound in the order (distance,
 //! index), which makes ties, and with them every result, independent of the shape of the tree.
 
+mod build;
+
 use nalgebra::Point3;
 
-/// Points per leaf. Measured on voxel-sampled scans: 8 to 16 are equally fast, 32 is slower.
-const LEAF_SIZE: usize = 12;
+use self::build::{Entry, Node};
 
 /// A point found by a query.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -41,22 +42,6 @@ impl Neighbour {
     fn closer_than(radius: f64) -> Neighbour {
         Neighbour { index: 0, squared_distance: radius * radius }
     }
-}
-
-/// A point as the leaves keep it.
-#[derive(Debug, Clone, Copy)]
-struct Entry {
-    position: [f64; 3],
-    index: u32,
-}
-
-#[derive(Debug, Clone, Copy)]
-enum Node {
-    /// The entries `begin..end`.
-    Leaf { begin: u32, end: u32 },
-    /// The left child follows at once, the right one stands at `right`. Along `axis` the left points end at
-    /// `left_max` and the right ones begin at `right_min`.
-    Split { axis: u8, right: u32, left_max: f64, right_min: f64 },
 }
 
 /// An exact nearest-neighbour index over at most `2^32 - 1` points (further ones are not indexed).
@@ -205,54 +190,41 @@ impl KdTree {
             }
             Node::Split { axis, right, left_max, right_min } => {
                 let axis = usize::from(axis);
-                let beyond_left = query[axis] - left_max;
-                let before_right = right_min - query[axis];
+                let (beyond_left, before_right) = (query[axis] - left_max, right_min - query[axis]);
                 let left = (node + 1, beyond_left);
                 let right = (right as usize, before_right);
                 let (near, far) =
                     if beyond_left <= before_right { (left, right) } else { (right, left) };
-                for (child, gap) in [near, far] {
-                    let mut offset = offset;
-                    offset[axis] = offset[axis].max(gap);
-                    // Summed like the distance of a point, so that rounding can never hide one.
-                    let closest = Neighbour {
-                        squared_distance: squared_length(&offset),
-                        index: self.lowest[child] as usize,
-                    };
-                    if closest.precedes(bound) {
-                        self.visit(child, query, offset, bound, offer);
-                    }
-                }
+                self.enter(near.0, axis, near.1, query, offset, bound, offer);
+                self.enter(far.0, axis, far.1, query, offset, bound, offer);
             }
         }
     }
 
-    /// Appends the subtree over `entries`, which will stand at `begin`; returns their lowest index.
-    fn split(&mut self, entries: &mut [Entry], begin: u32) -> u32 {
-        let node = self.nodes.len();
-        let end = begin + entries.len() as u32;
-        self.nodes.push(Node::Leaf { begin, end });
-        self.lowest.push(0);
-        let lowest = if entries.len() <= LEAF_SIZE {
-            entries.iter().map(|entry| entry.index).min().unwrap_or(0)
-        } else {
-            let axis = widest_axis(entries);
-            let middle = entries.len() / 2;
-            entries.select_nth_unstable_by(middle, |a, b| {
-                a.position[axis].total_cmp(&b.position[axis]).then(a.index.cmp(&b.index))
-            });
-            let (left, right) = entries.split_at_mut(middle);
-            let left_max = fold_axis(left, axis, f64::max);
-            let right_min = fold_axis(right, axis, f64::min);
-            let lowest_left = self.split(left, begin);
-            let right_node = self.nodes.len() as u32;
-            let lowest_right = self.split(right, begin + middle as u32);
-            self.nodes[node] =
-                Node::Split { axis: axis as u8, right: right_node, left_max, right_min };
-            lowest_left.min(lowest_right)
-        };
-        self.lowest[node] = lowest;
-        lowest
+    /// Visits a child whose region begins `gap` away along `axis`, unless nothing in it precedes the bound.
+    #[inline]
+    #[expect(clippy::too_many_arguments, reason = "the state of one recursion")]
+    fn enter(
+        &self,
+        child: usize,
+        axis: usize,
+        gap: f64,
+        query: &[f64; 3],
+        mut offset: [f64; 3],
+        bound: &mut Neighbour,
+        offer: &mut impl FnMut(Neighbour, &mut Neighbour),
+    ) {
+        if gap > offset[axis] {
+            offset[axis] = gap;
+        }
+        // Summed like the distance of a point, so that rounding can never hide one.
+        let squared_distance = squared_length(&offset);
+        let may_precede = squared_distance < bound.squared_distance
+            || (squared_distance == bound.squared_distance
+                && (self.lowest[child] as usize) < bound.index);
+        if may_precede {
+            self.visit(child, query, offset, bound, offer);
+        }
     }
 }
 
@@ -278,25 +250,6 @@ fn keep_closest(found: &mut Vec<Neighbour>, k: usize) -> Neighbour {
     let last = *last;
     found.truncate(k);
     last
-}
-
-fn fold_axis(entries: &[Entry], axis: usize, choose: fn(f64, f64) -> f64) -> f64 {
-    entries.iter().map(|entry| entry.position[axis]).fold(f64::NAN, choose)
-}
-
-/// The axis along which the points spread most.
-fn widest_axis(entries: &[Entry]) -> usize {
-    let mut low = [f64::INFINITY; 3];
-    let mut high = [f64::NEG_INFINITY; 3];
-    for entry in entries {
-        for axis in 0..3 {
-            low[axis] = low[axis].min(entry.position[axis]);
-            high[axis] = high[axis].max(entry.position[axis]);
-        }
-    }
-    let spread = |axis: usize| high[axis] - low[axis];
-    let first = if spread(1) > spread(0) { 1 } else { 0 };
-    if spread(2) > spread(first) { 2 } else { first }
 }
 
 #[cfg(test)]

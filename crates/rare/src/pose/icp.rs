@@ -9,10 +9,10 @@ use nalgebra::{Matrix6, Point3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::data::{KdTree, Neighbour, RigidTransform};
+use crate::data::RigidTransform;
 use crate::error::{Error, Result};
-use crate::pose::RobustKernel;
 use crate::pose::normal_equations::NormalEquations;
+use crate::pose::{IcpTarget, RobustKernel};
 
 /// Points per unit of parallel work; independent of the number of threads, so that sums are too.
 const CHUNK: usize = 1024;
@@ -62,45 +62,6 @@ impl Icp {
     }
 }
 
-/// A target cloud prepared once for any number of alignments.
-#[derive(Debug, Clone)]
-pub struct IcpTarget {
-    points: Vec<Point3<f64>>,
-    normals: Vec<Vector3<f64>>,
-    tree: KdTree,
-}
-
-impl IcpTarget {
-    /// Takes points (metres) and a unit normal each (either sign; zero where there is none: such points are found but
-    /// pull at nothing).
-    ///
-    /// # Errors
-    /// `InvalidInput` if there is no point, or not one normal per point.
-    pub fn new(points: Vec<Point3<f64>>, normals: Vec<Vector3<f64>>) -> Result<IcpTarget> {
-        if points.is_empty() || points.len() != normals.len() {
-            return Err(Error::invalid(format!(
-                "an icp target needs points and one normal for each, got {} points and {} normals",
-                points.len(),
-                normals.len()
-            )));
-        }
-        let tree = KdTree::new(&points);
-        Ok(IcpTarget { points, normals, tree })
-    }
-
-    /// The points, metres.
-    #[must_use]
-    pub fn points(&self) -> &[Point3<f64>] {
-        &self.points
-    }
-
-    /// The index over the points.
-    #[must_use]
-    pub fn tree(&self) -> &KdTree {
-        &self.tree
-    }
-}
-
 /// An aligned pose and its evidence, all evaluated at exactly this pose with the last stage's settings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IcpResult {
@@ -140,18 +101,9 @@ impl Icp {
         let mut pose = *initial;
         let (mut iterations, mut converged) = (0, false);
         for stage in &self.stages {
-            converged = false;
-            for _ in 0..self.max_iterations {
-                let equations = run.linearise(&pose, stage);
-                let Some(step) = equations.solve(DAMPING) else { break };
-                pose = step.about(&equations.centre) * pose;
-                iterations += 1;
-                converged = step.rotation.norm() < self.rotation_tolerance
-                    && step.translation.norm() < self.translation_tolerance;
-                if converged {
-                    break;
-                }
-            }
+            let rounds;
+            (pose, rounds, converged) = self.run_stage(&mut run, pose, stage);
+            iterations += rounds;
         }
         let at_end = run.linearise(&pose, &last);
         if at_end.weight <= 0.0 {
@@ -170,6 +122,26 @@ impl Icp {
             open_directions: at_end.open_directions(),
             information: at_end.information(),
         })
+    }
+
+    /// Steps until one is small; the pose, the number of steps, and whether the last one was small.
+    fn run_stage(
+        &self,
+        run: &mut Run,
+        mut pose: RigidTransform,
+        stage: &IcpStage,
+    ) -> (RigidTransform, usize, bool) {
+        for round in 0..self.max_iterations {
+            let equations = run.linearise(&pose, stage);
+            let Some(step) = equations.solve(DAMPING) else { return (pose, round, false) };
+            pose = step.about(&equations.centre) * pose;
+            if step.rotation.norm() < self.rotation_tolerance
+                && step.translation.norm() < self.translation_tolerance
+            {
+                return (pose, round + 1, true);
+            }
+        }
+        (pose, self.max_iterations, false)
     }
 
     fn validated_last_stage(&self, source: &[Point3<f64>]) -> Result<IcpStage> {
@@ -231,40 +203,12 @@ impl<'a> Run<'a> {
     }
 }
 
-impl IcpTarget {
-    /// The nearest target point closer than `radius`, sought with an earlier match as the guess.
-    fn closest(&self, point: &Point3<f64>, guess: u32, radius: f64) -> Option<Neighbour> {
-        let guess = Neighbour::of(&self.points, guess as usize, point)?;
-        if guess.squared_distance < radius * radius {
-            Some(self.tree.nearest_from(point, guess))
-        } else {
-            self.tree.nearest_within(point, radius)
-        }
-    }
-
-    fn add_pair(
-        &self,
-        sums: &mut NormalEquations,
-        point: &Point3<f64>,
-        found: Neighbour,
-        kernel: RobustKernel,
-        width: f64,
-    ) {
-        sums.add_match(found.squared_distance);
-        let (target, normal) = (self.points[found.index], self.normals[found.index]);
-        let residual = (point - target).dot(&normal);
-        let weight = kernel.weight(residual, width);
-        if weight > 0.0 && normal != Vector3::zeros() {
-            sums.add_plane(point, &normal, residual, weight);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use nalgebra::Rotation3;
 
     use super::*;
+    use crate::data::KdTree;
     use crate::features::estimate_normals;
     use crate::random::Random;
 
@@ -322,7 +266,7 @@ mod tests {
             let squares: Vec<f64> = source
                 .iter()
                 .map(|point| result.target_from_source.apply(point))
-                .filter_map(|moved| target.tree.nearest_within(&moved, 0.15))
+                .filter_map(|moved| target.tree().nearest_within(&moved, 0.15))
                 .map(|found| found.squared_distance)
                 .collect();
             assert_eq!(result.fitness, squares.len() as f64 / 4000.0);

@@ -1,13 +1,23 @@
 //! Pose estimators: correspondences in, a rigid transform with evidence out.
 
+mod consensus;
+mod consistency;
 mod icp;
+mod icp_target;
 mod normal_equations;
+mod ransac;
 mod rigid_fit;
 mod robust_kernel;
+mod sc2_pcr;
+mod spectral;
 
-pub use icp::{Icp, IcpResult, IcpStage, IcpTarget};
+pub use consistency::{CompatibilityGraph, Consistency};
+pub use icp::{Icp, IcpResult, IcpStage};
+pub use icp_target::IcpTarget;
+pub use ransac::Ransac;
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
+pub use sc2_pcr::{Sc2Pcr, Sc2PcrMode, Sc2PcrSeeds};
 
 use crate::data::{Correspondence, PointCloud, RigidTransform};
 use crate::error::Result;
