@@ -6,35 +6,18 @@
 
 use nalgebra::Point3;
 
-use crate::data::{DepthMap, FeatureMap, KdTree, PointFeatures, normalise};
+use serde::{Deserialize, Serialize};
 
-/// The depths, metres along the camera's z axis, at which a pixel counts as seen; both ends are excluded.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct DepthRange {
-    /// Depths up to this are too near.
-    pub min: f64,
-    /// Depths from this on are too far.
-    pub max: f64,
-}
+use crate::data::{DepthMap, DepthRange, FeatureMap, KdTree, PointFeatures, normalise};
 
-impl DepthRange {
-    /// Rooms, as FreeReg has it for 3DMatch: 1 cm to 10 m.
-    #[must_use]
-    pub fn indoor() -> DepthRange {
-        DepthRange { min: 0.01, max: 10.0 }
-    }
-
-    /// Streets, as FreeReg has it for KITTI: 0.5 m to 80 m.
-    #[must_use]
-    pub fn kitti() -> DepthRange {
-        DepthRange { min: 0.5, max: 80.0 }
-    }
-
-    /// Whether `depth` lies inside.
-    #[must_use]
-    pub fn contains(&self, depth: f64) -> bool {
-        self.min < depth && depth < self.max
-    }
+/// How the feature of a keypoint is taken from the map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Sampling {
+    /// Bilinear between cells, with the corners of map and image aligned, as FreeReg does.
+    AlignedCorners,
+    /// The keypoint's own cell: for encoders whose cells are centred where [`keypoint_grid`] puts the keypoints.
+    OwnCell,
 }
 
 /// The keypoints of one view of one cloud.
@@ -75,38 +58,48 @@ fn grid_axis(pixels: usize, cells: usize) -> Vec<usize> {
 
 /// Lifts the grid pixels of `map` at which `depth` (densified) lies in `range` to points with features.
 ///
-/// Features are interpolated bilinearly with the corners of map and image aligned, then divided by their norm + 1e-5.
+/// Features are taken as `sampling` says, then divided by their norm + 1e-5.
 /// Pixels whose feature is all zero or not finite are left out: the encoder knew nothing there.
 ///
 /// ```
+/// use rare::data::DepthRange;
 /// use rare::{DepthMap, FeatureMap, Intrinsics, transfer};
+/// use rare::transfer::Sampling;
 /// let intrinsics = Intrinsics { width: 8, height: 6, fx: 8.0, fy: 8.0, cx: 4.0, cy: 3.0 };
 /// let mut depth = DepthMap::empty(intrinsics);
 /// depth.depth_mut()[8 * 3 + 4] = 2.0;
 /// let map = FeatureMap::new(1, 3, 4, (0..12).map(|i| i as f32).collect())?;
-/// let lifted = transfer::lift(&map, &depth, transfer::DepthRange::indoor());
+/// let lifted = transfer::lift(&map, &depth, DepthRange::indoor(), Sampling::AlignedCorners);
 /// // Twelve grid pixels, two by two pixels apart; the only one seen is (5, 3).
 /// assert!(lifted.keypoints.is_empty());
 /// depth.depth_mut()[8 * 3 + 5] = 2.0;
-/// let lifted = transfer::lift(&map, &depth, transfer::DepthRange::indoor());
+/// let lifted = transfer::lift(&map, &depth, DepthRange::indoor(), Sampling::AlignedCorners);
 /// assert_eq!(lifted.pixels, [(5, 3)]);
 /// assert_eq!(lifted.keypoints.points()[0].coords.as_slice(), [0.25, 0.0, 2.0]);
 /// # Ok::<(), rare::Error>(())
 /// ```
 #[must_use]
-pub fn lift(map: &FeatureMap, depth: &DepthMap, range: DepthRange) -> Lifted {
+pub fn lift(map: &FeatureMap, depth: &DepthMap, range: DepthRange, sampling: Sampling) -> Lifted {
     let (width, height) = (depth.width(), depth.height());
     let values = channels_last(map);
     let mut lifted = Lifted { keypoints: PointFeatures::empty(map.channels()), pixels: Vec::new() };
     let mut feature = vec![0.0; map.channels()];
-    for (u, v) in keypoint_grid(width, height, map.width(), map.height()) {
+    let grid = keypoint_grid(width, height, map.width(), map.height());
+    for (cell, (u, v)) in grid.into_iter().enumerate() {
         let seen = f64::from(depth.at(u, v));
         if !range.contains(seen) {
             continue;
         }
-        let x = Tap::new(u, width, map.width());
-        let y = Tap::new(v, height, map.height());
-        interpolate(&values, map, x, y, &mut feature);
+        match sampling {
+            Sampling::OwnCell => {
+                feature.copy_from_slice(&values[cell * map.channels()..][..map.channels()])
+            }
+            Sampling::AlignedCorners => {
+                let x = Tap::new(u, width, map.width());
+                let y = Tap::new(v, height, map.height());
+                interpolate(&values, map, x, y, &mut feature);
+            }
+        }
         if feature.iter().all(|value| value.is_finite()) && feature.iter().any(|&x| x != 0.0) {
             let point = depth.intrinsics().back_project(u as f64, v as f64, seen);
             lifted.keypoints.push(point, normalise(&feature));

@@ -57,3 +57,32 @@ pub struct Camera {
     /// The pose: moves points of the world into the camera's frame.
     pub camera_from_world: RigidTransform,
 }
+
+/// The depths, along the camera's z axis, at which a pixel counts as seen; both ends are excluded.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DepthRange {
+    /// Depths up to this are too near.
+    pub min: f64,
+    /// Depths from this on are too far.
+    pub max: f64,
+}
+
+impl DepthRange {
+    /// Rooms, as FreeReg has it for 3DMatch: 1 cm to 10 m.
+    #[must_use]
+    pub fn indoor() -> DepthRange {
+        DepthRange { min: 0.01, max: 10.0 }
+    }
+
+    /// Streets, as FreeReg has it for KITTI: 0.5 m to 80 m.
+    #[must_use]
+    pub fn kitti() -> DepthRange {
+        DepthRange { min: 0.5, max: 80.0 }
+    }
+
+    /// Whether `depth` lies inside.
+    #[must_use]
+    pub fn contains(&self, depth: f64) -> bool {
+        self.min < depth && depth < self.max
+    }
+}

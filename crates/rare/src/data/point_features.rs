@@ -76,6 +76,20 @@ impl PointFeatures {
         self.values.get(index * self.dimension..(index + 1) * self.dimension).unwrap_or(&[])
     }
 
+    /// The same points with features of unit length (divided by their norm + 1e-5).
+    #[must_use]
+    pub fn normalised(&self) -> PointFeatures {
+        let values = (0..self.len()).flat_map(|index| normalise(self.feature(index))).collect();
+        PointFeatures { points: self.points.clone(), dimension: self.dimension, values }
+    }
+
+    /// The same features at moved points.
+    #[must_use]
+    pub fn map_points(mut self, move_point: impl Fn(&Point3<f64>) -> Point3<f64>) -> PointFeatures {
+        self.points.iter_mut().for_each(|point| *point = move_point(point));
+        self
+    }
+
     /// The points and features at `indices`, in that order; indices out of range are passed over.
     #[must_use]
     pub fn select(&self, indices: &[usize]) -> PointFeatures {

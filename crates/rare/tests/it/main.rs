@@ -8,14 +8,20 @@
 )]
 
 mod aggregate;
+mod clouds;
+mod densify;
+mod fpfh;
+mod hint;
+mod hostile_files;
 mod matching;
 mod metrics;
-mod shared;
-mod transfer;
-mod fpfh;
+mod poses;
+mod project;
 mod ransac;
 mod real_pairs;
+mod reduce;
 mod sc2_pcr;
 mod shared;
 mod synthetic_pairs;
+mod transfer;
 mod weighted_fit;

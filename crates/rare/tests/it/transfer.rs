@@ -1,8 +1,9 @@
 //! Steps 5 and 6 against the golden keypoints, samples, common points and fused features.
 
 use nalgebra::{Point3, Rotation3, Vector3};
+use rare::data::DepthRange;
 use rare::fuse::fuse;
-use rare::transfer::{self, DepthRange};
+use rare::transfer::{self, Sampling};
 use rare::{DepthMap, FeatureMap, Intrinsics, PointFeatures, RigidTransform};
 
 use crate::shared::{Array, Golden};
@@ -51,7 +52,7 @@ fn golden_view(golden: &mut Golden) -> (FeatureMap, DepthMap) {
 fn golden_keypoints_and_features() {
     let Some(mut golden) = Golden::open("rare/s7_keypoints.npz") else { return };
     let (map, depth) = golden_view(&mut golden);
-    let lifted = transfer::lift(&map, &depth, DepthRange::indoor());
+    let lifted = transfer::lift(&map, &depth, DepthRange::indoor(), Sampling::AlignedCorners);
     let mask = golden.array("depth_mask").values;
     let kept: Vec<usize> = (0..mask.len()).filter(|&index| mask[index] == 1.0).collect();
     let grid = pixels(&golden.array("grid_3dmatch"));
@@ -106,7 +107,7 @@ fn pixels_of_which_nothing_is_known_are_left_out() {
     let depth = DepthMap::new(intrinsics, depth).unwrap();
     let features = [1.0, 1.0, 1.0, 0.0, f32::NAN, -3.0].repeat(2);
     let map = FeatureMap::new(1, 2, 6, features).unwrap();
-    let lifted = transfer::lift(&map, &depth, DepthRange::indoor());
+    let lifted = transfer::lift(&map, &depth, DepthRange::indoor(), Sampling::AlignedCorners);
     assert_eq!(lifted.pixels, [(5, 0), (5, 1)]);
     assert!(lifted.keypoints.values().iter().all(|value| (value + 1.0).abs() < 1e-5));
 }
@@ -119,7 +120,10 @@ fn odd_sizes_do_not_panic() {
     let intrinsics = Intrinsics { width: 1, height: 1, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 };
     let depth = DepthMap::new(intrinsics, vec![1.0]).unwrap();
     let map = FeatureMap::new(2, 3, 5, vec![1.0; 30]).unwrap();
-    assert_eq!(transfer::lift(&map, &depth, DepthRange::indoor()).pixels, [(0, 0)]);
+    assert_eq!(
+        transfer::lift(&map, &depth, DepthRange::indoor(), Sampling::AlignedCorners).pixels,
+        [(0, 0)]
+    );
     assert!(transfer::common_points(&[Point3::origin()], &[], 1.0).is_empty());
     let broken = [Point3::new(f64::NAN, 0.0, 0.0)];
     assert!(transfer::common_points(&broken, &[Point3::origin()], 1.0).is_empty());

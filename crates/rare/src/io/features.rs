@@ -1,0 +1,137 @@
+//! Features and correspondences of other programs, as NPZ archives.
+
+use std::path::Path;
+
+use nalgebra::Point3;
+
+use super::npy::Array;
+use super::npz::{self, Entry, NpzFile};
+use super::whole_file::write_whole;
+use crate::data::{Correspondence, PointFeatures};
+use crate::error::{Error, Result};
+
+/// Reads points with a feature vector each: an NPZ archive of `points` (`N x 3`, metres, in the cloud's frame) and
+/// `features` (`N x D`).
+///
+/// # Errors
+/// `Io` if the file cannot be read, `InvalidInput` if an array is missing, has another shape or a number that is not
+/// finite.
+pub fn read_point_features(path: impl AsRef<Path>) -> Result<PointFeatures> {
+    let path = path.as_ref();
+    let mut file = NpzFile::open(path)?;
+    let points = points(path, &mut file, "points")?;
+    let features = file.array_f32("features")?;
+    let &[rows, dimension @ 1..=usize::MAX] = features.shape.as_slice() else {
+        return Err(shape_error(path, "features", "N x D", &features.shape));
+    };
+    if rows != points.len() {
+        return Err(count_error(path, "points", points.len(), "features", rows));
+    }
+    check_finite(path, "features", &features.values, dimension)?;
+    PointFeatures::new(points, dimension, features.values)
+        .map_err(|error| super::name_file(path, error))
+}
+
+/// Writes what [`read_point_features`] reads: `points` as 64-bit, `features` as 32-bit floats.
+///
+/// # Errors
+/// Those of [`write_whole`].
+pub fn write_point_features(path: impl AsRef<Path>, features: &PointFeatures) -> Result<()> {
+    let coordinates = features.points().iter().flat_map(|point| point.coords.as_slice());
+    let entries = [
+        Entry {
+            name: "points",
+            kind: "f8",
+            shape: &[features.len(), 3],
+            data: coordinates.flat_map(|value| value.to_le_bytes()).collect(),
+        },
+        Entry {
+            name: "features",
+            kind: "f4",
+            shape: &[features.len(), features.dimension()],
+            data: features.values().iter().flat_map(|value| value.to_le_bytes()).collect(),
+        },
+    ];
+    write_whole(path, |writer| npz::write(writer, &entries))
+}
+
+/// Reads correspondences: an NPZ archive of `source` and `reference` (`N x 3`, metres, each in its cloud's frame) and,
+/// if there is one, `score` (`N`, at least 0; 1 where it is missing).
+///
+/// # Errors
+/// `Io` if the file cannot be read, `InvalidInput` if an array is missing, has another shape, a number that is not
+/// finite or a negative score.
+pub fn read_correspondences(path: impl AsRef<Path>) -> Result<Vec<Correspondence>> {
+    let path = path.as_ref();
+    let mut file = NpzFile::open(path)?;
+    let source = points(path, &mut file, "source")?;
+    let target = points(path, &mut file, "reference")?;
+    if source.len() != target.len() {
+        return Err(count_error(path, "source", source.len(), "reference", target.len()));
+    }
+    let scores = if file.names().iter().any(|name| name == "score") {
+        scores(path, &file.array_f64("score")?, source.len())?
+    } else {
+        vec![1.0; source.len()]
+    };
+    let pairs = source.into_iter().zip(target).zip(scores);
+    Ok(pairs.map(|((source, target), score)| Correspondence { source, target, score }).collect())
+}
+
+fn points(path: &Path, file: &mut NpzFile, name: &str) -> Result<Vec<Point3<f64>>> {
+    let array = file.array_f64(name)?;
+    if !matches!(array.shape.as_slice(), [_, 3]) {
+        return Err(shape_error(path, name, "N x 3", &array.shape));
+    }
+    check_finite(path, name, &array.values, 3)?;
+    Ok(array.values.chunks_exact(3).map(Point3::from_slice).collect())
+}
+
+fn scores(path: &Path, array: &Array<f64>, count: usize) -> Result<Vec<f64>> {
+    if array.values.len() != count {
+        return Err(count_error(path, "source", count, "score", array.values.len()));
+    }
+    match array.values.iter().position(|score| !(score.is_finite() && *score >= 0.0)) {
+        Some(row) => Err(Error::in_file(
+            path,
+            format!("score {row} is {}: scores must be finite and at least 0", array.values[row]),
+        )),
+        None => Ok(array.values.clone()),
+    }
+}
+
+/// Dropping a row would shift what belongs together, so a number that is not finite is an error.
+fn check_finite<T: Copy + Into<f64>>(
+    path: &Path,
+    name: &str,
+    values: &[T],
+    width: usize,
+) -> Result<()> {
+    match values.iter().position(|&value| !value.into().is_finite()) {
+        Some(at) => Err(Error::in_file(
+            path,
+            format!(
+                "row {} of {name} has a number that is not finite: remove it from every array",
+                at / width
+            ),
+        )),
+        None => Ok(()),
+    }
+}
+
+fn shape_error(path: &Path, name: &str, expected: &str, shape: &[usize]) -> Error {
+    Error::in_file(path, format!("{name} has the shape {shape:?}, {expected} is needed"))
+}
+
+fn count_error(
+    path: &Path,
+    first: &str,
+    first_count: usize,
+    second: &str,
+    second_count: usize,
+) -> Error {
+    Error::in_file(
+        path,
+        format!("{first} has {first_count} rows and {second} {second_count}: they must be as many"),
+    )
+}

@@ -1,0 +1,97 @@
+//! What can be set, with defaults.
+
+use serde::{Deserialize, Serialize};
+
+use crate::scale::Profile;
+use crate::viewpoints::CameraChoice;
+
+/// Everything that [`crate::Refiner`] can be told. The default is the default preset.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RefinerConfig {
+    /// Which fixed constants to use; `auto` derives them from the clouds.
+    pub profile: Profile,
+    /// Which virtual cameras to use; `auto` chooses by the kind of scene.
+    pub camera: CameraChoice,
+    /// Voxel size, metres, instead of the profile's; all other lengths follow it.
+    pub voxel: Option<f64>,
+    /// Seed of everything random (the choice of keypoints).
+    pub seed: u64,
+    /// What is done, beyond lengths.
+    pub recipe: Recipe,
+}
+
+/// The switches between the paper's recipe and the default preset; each is one documented difference.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Recipe {
+    /// Whether depths are taken in metres as the recipe has them, instead of in units that make a voxel 5 cm.
+    pub metric: bool,
+    /// How often the clouds are rendered, matched and aligned; the paper does it once.
+    pub rounds: usize,
+    /// Principal components kept per layer and view; `None` leaves the features as they are. The paper keeps 128.
+    pub components: Option<usize>,
+    /// Whether features are interpolated at the keypoints with aligned corners (the paper's source FreeReg) instead
+    /// of being taken from the keypoint's own cell.
+    pub aligned_corners: bool,
+    /// Whether each set gives hypotheses by consensus (SC2-PCR) instead of one weighted fit over all its pairs.
+    pub consensus: bool,
+    /// Whether the initial transform competes with the refined one, and the winner is chosen by depth consistency.
+    pub keep_initial: bool,
+    /// Whether the result is polished by robust point-to-plane ICP, kept only if it verifies better.
+    pub polish: bool,
+    /// Times the weights are recomputed from the surviving inliers (`N_r` of section 3.3).
+    pub reweighting_rounds: usize,
+    /// Number of best correspondences in the last fit (`K` of section 3.3).
+    pub top: usize,
+    /// Most 3D keypoints used per cloud; `None`: 500, LiDAR 1000.
+    pub keypoints: Option<usize>,
+}
+
+impl Default for RefinerConfig {
+    fn default() -> RefinerConfig {
+        RefinerConfig {
+            profile: Profile::Auto,
+            camera: CameraChoice::Auto,
+            voxel: None,
+            seed: 0,
+            recipe: Recipe::default(),
+        }
+    }
+}
+
+impl Default for Recipe {
+    fn default() -> Recipe {
+        Recipe {
+            metric: false,
+            rounds: 3,
+            components: None,
+            aligned_corners: false,
+            consensus: true,
+            keep_initial: true,
+            polish: true,
+            reweighting_rounds: 5,
+            top: 250,
+            keypoints: None,
+        }
+    }
+}
+
+impl Recipe {
+    /// The paper's recipe unchanged.
+    #[must_use]
+    pub fn paper() -> Recipe {
+        Recipe {
+            metric: true,
+            rounds: 1,
+            components: Some(128),
+            aligned_corners: true,
+            consensus: false,
+            keep_initial: false,
+            polish: false,
+            reweighting_rounds: 5,
+            top: 250,
+            keypoints: None,
+        }
+    }
+}
