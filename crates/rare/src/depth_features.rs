@@ -97,7 +97,8 @@ impl DepthFeatures {
             // Cells of a row lie side by side in each channel: one band at a time keeps the writes together.
             for (channel, image) in values.chunks_exact_mut(cells).enumerate() {
                 let cells_of_row = &mut image[row * columns..(row + 1) * columns];
-                for (value, descriptor) in cells_of_row.iter_mut().zip(band.chunks_exact(dimension)) {
+                for (value, descriptor) in cells_of_row.iter_mut().zip(band.chunks_exact(dimension))
+                {
                     *value = descriptor[channel];
                 }
             }

@@ -54,8 +54,8 @@ pub(super) fn reduce_all(
     let mut layers = layers.into_iter();
     while let Some(reference) = layers.next() {
         let source = layers.next();
-        let source =
-            source.ok_or_else(|| Error::Internal(format!("features for {maps} maps, an odd number")))?;
+        let source = source
+            .ok_or_else(|| Error::Internal(format!("features for {maps} maps, an odd number")))?;
         views.push(match (components, <[FeatureMap; 1]>::try_from(reference), source) {
             (None, Ok([reference]), mut source) if source.len() == 1 => {
                 Both { reference, source: source.remove(0) }
