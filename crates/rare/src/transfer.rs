@@ -132,9 +132,13 @@ pub fn common_points(
 fn channels_last(map: &FeatureMap) -> Vec<f32> {
     let (channels, cells) = (map.channels(), map.width() * map.height());
     let mut values = vec![0.0; channels * cells];
-    for (channel, image) in map.values().chunks_exact(cells).enumerate() {
-        for (feature, &value) in values.chunks_exact_mut(channels).zip(image) {
-            feature[channel] = value;
+    // As many channels at a time as a cache line holds.
+    for (block, images) in map.values().chunks(16 * cells).enumerate() {
+        for (cell, feature) in values.chunks_exact_mut(channels).enumerate() {
+            let channels = feature[16 * block..].iter_mut();
+            for (value, image) in channels.zip(images.chunks_exact(cells)) {
+                *value = image[cell];
+            }
         }
     }
     values
