@@ -15,9 +15,6 @@ use crate::data::{Correspondence, CorrespondenceSet, CorrespondenceSets, RigidTr
 use crate::error::{Error, Result};
 use crate::pose::fit_weighted;
 
-/// The fewest correspondences that determine a transform.
-const MINIMUM_PAIRS: usize = 3;
-
 /// The settings of the aggregation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Aggregation {
@@ -239,11 +236,8 @@ fn fit_set(set: &CorrespondenceSet) -> Option<RigidTransform> {
     fit(&set.pairs)
 }
 
-/// Equation (4): the weighted least-squares transform, if the pairs determine one.
+/// Equation (4): the weighted least-squares transform; `None` for fewer than three pairs or pairs on a line.
 fn fit(pairs: &[Correspondence]) -> Option<RigidTransform> {
-    if pairs.len() < MINIMUM_PAIRS {
-        return None;
-    }
     fit_weighted(pairs.iter().map(|pair| (pair.source, pair.target, weight(pair)))).ok()
 }
 

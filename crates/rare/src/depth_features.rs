@@ -86,32 +86,45 @@ impl DepthEncoder for DepthFeatures {
 impl DepthFeatures {
     /// One map: `dimension x (height / stride) x (width / stride)`; a cell without depth is all zero.
     fn describe(&self, map: &DepthMap, cosines: &Cosines) -> Result<FeatureMap> {
-        let (rows, columns) =
-            ((map.height() / self.stride).max(1), (map.width() / self.stride).max(1));
+        let rows = (map.height() / self.stride).max(1);
+        let columns = (map.width() / self.stride).max(1);
         let (cells, dimension) = (rows * columns, self.dimension());
         let surface = Surface::new(map, self.normal_baseline);
         let mut values = vec![0.0_f32; dimension * cells];
-        let mut descriptor = vec![0.0_f32; dimension];
-        let mut patch = vec![[0.0_f32; CHANNELS]; self.lattice * self.lattice];
-        let mut sums = vec![[0.0_f32; CHANNELS]; self.lattice];
-        for cell in 0..cells {
-            let u = (cell % columns) * self.stride + self.stride / 2;
-            let v = (cell / columns) * self.stride + self.stride / 2;
-            if map.at(u, v) <= 0.0 {
-                continue;
-            }
-            for (&radius, out) in
-                self.radii.iter().zip(descriptor.chunks_exact_mut(dimension / self.radii.len()))
-            {
-                self.sample_patch(&surface, (u, v), radius as f32, &mut patch);
-                cosines.transform(&patch, &mut sums, out);
-            }
-            let norm = descriptor.iter().map(|value| value * value).sum::<f32>().sqrt() + 1e-6;
-            for (channel, value) in descriptor.iter().enumerate() {
-                values[channel * cells + cell] = value / norm;
+        let mut band = vec![0.0_f32; dimension * columns];
+        for row in 0..rows {
+            self.describe_row(&surface, row * self.stride + self.stride / 2, cosines, &mut band);
+            // Cells of a row lie side by side in each channel: one band at a time keeps the writes together.
+            for (channel, image) in values.chunks_exact_mut(cells).enumerate() {
+                let cells_of_row = &mut image[row * columns..(row + 1) * columns];
+                for (value, descriptor) in cells_of_row.iter_mut().zip(band.chunks_exact(dimension))
+                {
+                    *value = descriptor[channel];
+                }
             }
         }
         FeatureMap::new(dimension, rows, columns, values)
+    }
+
+    /// The unit descriptors of one row of cells, `columns x dimension`.
+    fn describe_row(&self, surface: &Surface<'_>, v: usize, cosines: &Cosines, band: &mut [f32]) {
+        let dimension = self.dimension();
+        let of_radius = dimension / self.radii.len();
+        let mut patch = vec![[0.0_f32; CHANNELS]; self.lattice * self.lattice];
+        let mut sums = vec![[0.0_f32; CHANNELS]; self.lattice];
+        for (cell, descriptor) in band.chunks_exact_mut(dimension).enumerate() {
+            let u = cell * self.stride + self.stride / 2;
+            descriptor.fill(0.0);
+            if surface.map.at(u, v) <= 0.0 {
+                continue;
+            }
+            for (&radius, out) in self.radii.iter().zip(descriptor.chunks_exact_mut(of_radius)) {
+                self.sample_patch(surface, (u, v), radius as f32, &mut patch);
+                cosines.transform(&patch, &mut sums, out);
+            }
+            let norm = descriptor.iter().map(|value| value * value).sum::<f32>().sqrt() + 1e-6;
+            descriptor.iter_mut().for_each(|value| *value /= norm);
+        }
     }
 
     /// The lattice of half side `radius` around a pixel, row by row; clamped to the image.
@@ -126,11 +139,13 @@ impl DepthFeatures {
         let centre = map.at(u, v);
         let half = (self.lattice - 1) as f32 / 2.0;
         let step = radius * map.intrinsics().fx as f32 / centre / half;
+        let (left, top) = (u as f32 - half * step, v as f32 - half * step);
         for (row, points) in patch.chunks_exact_mut(self.lattice).enumerate() {
-            let y = nearest_pixel(v as f32 + (row as f32 - half) * step, map.height());
+            let y = nearest_pixel(top + row as f32 * step, map.height());
+            let pixels = &surface.pixels[y * map.width()..(y + 1) * map.width()];
             for (column, point) in points.iter_mut().enumerate() {
-                let x = nearest_pixel(u as f32 + (column as f32 - half) * step, map.width());
-                *point = self.sample(surface.pixels[y * map.width() + x], centre, radius);
+                let x = nearest_pixel(left + column as f32 * step, map.width());
+                *point = self.sample(pixels[x], centre, radius);
             }
         }
     }
@@ -150,8 +165,10 @@ impl DepthFeatures {
     }
 }
 
+/// The nearest pixel of a side of `size`; positions outside are clamped. (Casting saturates and truncates, which is
+/// rounding here, and far cheaper.)
 fn nearest_pixel(position: f32, size: usize) -> usize {
-    (position.round().max(0.0) as usize).min(size - 1)
+    ((position + 0.5) as usize).min(size - 1)
 }
 
 /// The low frequencies of the orthonormal cosine transform (DCT-II) along one side of a lattice.

@@ -206,7 +206,7 @@ impl Refiner {
         let sparse = clock.time("project", || views::project_all(pair, &viewpoints, pose));
         let dense = clock.time("densify", || views::densify_all(&sparse, self.densifier(pair)));
         let layers = clock.time("encode", || self.encode(pair, &dense))?;
-        let features = clock.time("reduce", || views::reduce_all(&layers, recipe.components))?;
+        let features = clock.time("reduce", || views::reduce_all(layers, recipe.components))?;
         let lifted = clock.time("transfer", || {
             views::transfer_all(pair, &viewpoints, pose, &dense, &features, self.sampling())
         });

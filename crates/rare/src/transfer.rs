@@ -5,7 +5,6 @@
 //! a feature of either kind.
 
 use nalgebra::Point3;
-
 use serde::{Deserialize, Serialize};
 
 use crate::data::{DepthMap, DepthRange, FeatureMap, KdTree, PointFeatures, normalise};
@@ -84,22 +83,21 @@ pub fn lift(map: &FeatureMap, depth: &DepthMap, range: DepthRange, sampling: Sam
     let values = channels_last(map);
     let mut lifted = Lifted { keypoints: PointFeatures::empty(map.channels()), pixels: Vec::new() };
     let mut feature = vec![0.0; map.channels()];
+    // A map finer than the image has cells without a keypoint at the far end of its rows.
+    let columns = map.width().min(width);
     let grid = keypoint_grid(width, height, map.width(), map.height());
-    for (cell, (u, v)) in grid.into_iter().enumerate() {
+    for (index, (u, v)) in grid.into_iter().enumerate() {
         let seen = f64::from(depth.at(u, v));
         if !range.contains(seen) {
             continue;
         }
-        match sampling {
-            Sampling::OwnCell => {
-                feature.copy_from_slice(&values[cell * map.channels()..][..map.channels()]);
-            }
+        let (x, y) = match sampling {
             Sampling::AlignedCorners => {
-                let x = Tap::new(u, width, map.width());
-                let y = Tap::new(v, height, map.height());
-                interpolate(&values, map, x, y, &mut feature);
+                (Tap::new(u, width, map.width()), Tap::new(v, height, map.height()))
             }
-        }
+            Sampling::OwnCell => (Tap::at(index % columns), Tap::at(index / columns)),
+        };
+        interpolate(&values, map, x, y, &mut feature);
         if feature.iter().all(|value| value.is_finite()) && feature.iter().any(|&x| x != 0.0) {
             let point = depth.intrinsics().back_project(u as f64, v as f64, seen);
             lifted.keypoints.push(point, normalise(&feature));
@@ -152,6 +150,11 @@ struct Tap {
 }
 
 impl Tap {
+    /// On a cell.
+    fn at(cell: usize) -> Tap {
+        Tap { low: cell, high: cell, fraction: 0.0 }
+    }
+
     /// With the first and the last pixel on the first and the last cell ("align corners").
     fn new(pixel: usize, pixels: usize, cells: usize) -> Tap {
         let last = cells.saturating_sub(1);

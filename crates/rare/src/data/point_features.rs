@@ -2,7 +2,6 @@
 
 use nalgebra::Point3;
 
-use crate::data::RigidTransform;
 use crate::error::{Error, Result};
 
 /// `N` points (metres, in their cloud's own frame) and an `N x dimension` row-major matrix of their features.
@@ -100,15 +99,6 @@ impl PointFeatures {
             dimension: self.dimension,
             values: kept.iter().flat_map(|&index| self.feature(index)).copied().collect(),
         }
-    }
-
-    /// The same features at points moved into another frame.
-    #[must_use]
-    pub fn transformed(mut self, other_from_this: &RigidTransform) -> PointFeatures {
-        for point in &mut self.points {
-            *point = other_from_this.apply(point);
-        }
-        self
     }
 
     /// Appends a point; its feature is cut, or filled up with zeros, to the dimension.

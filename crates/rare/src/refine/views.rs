@@ -44,20 +44,30 @@ pub(super) fn densify_all(sparse: &[DepthMap], densifier: Densifier) -> Vec<Dept
     sparse.par_iter().map(|map| densifier.densify(map)).collect()
 }
 
-/// Step 4: one merged feature map per cloud and view.
+/// Step 4: one merged feature map per cloud and view. A single layer that is not to be reduced is used as it is.
 pub(super) fn reduce_all(
-    layers: &[LayeredFeatures],
+    layers: Vec<LayeredFeatures>,
     components: Option<usize>,
 ) -> Result<Vec<Both<FeatureMap>>> {
-    let (views, rest) = layers.as_chunks::<2>();
-    if !rest.is_empty() {
-        return Err(Error::Internal(format!("an encoder gave features for {} maps", layers.len())));
+    let maps = layers.len();
+    let mut views = Vec::with_capacity(maps / 2);
+    let mut layers = layers.into_iter();
+    while let Some(reference) = layers.next() {
+        let source = layers.next();
+        let source = source
+            .ok_or_else(|| Error::Internal(format!("features for {maps} maps, an odd number")))?;
+        views.push(match (components, <[FeatureMap; 1]>::try_from(reference), source) {
+            (None, Ok([reference]), mut source) if source.len() == 1 => {
+                Both { reference, source: source.remove(0) }
+            }
+            (_, reference, source) => {
+                let reference = reference.map_or_else(|layers| layers, Vec::from);
+                let (reference, source) = reduce(&reference, &source, components)?;
+                Both { reference, source }
+            }
+        });
     }
-    let reduced = views.iter().map(|[reference, source]| {
-        let (reference, source) = reduce(reference, source, components)?;
-        Ok(Both { reference, source })
-    });
-    reduced.collect()
+    Ok(views)
 }
 
 /// Step 5: pixels become points of their own cloud, with features.

@@ -127,6 +127,25 @@ fn a_locality_prior_leaves_out_what_is_too_far() {
 }
 
 #[test]
+fn the_locality_prior_reaches_to_its_distance() {
+    // Two walls 0.5 m apart: no tile may be passed over whose nearest points are just near enough.
+    let wall = |x: f64, seed| {
+        let plain = random_features(600, 8, seed);
+        let points = plain.points().iter().map(|point| Point3::new(x, point.y, point.z)).collect();
+        PointFeatures::new(points, 8, plain.values().to_vec()).unwrap()
+    };
+    let (a, b) = (wall(0.0, 9), wall(0.5, 10));
+    let found = |max_distance: f64| {
+        let (source_points, target_points) = (a.points(), b.points());
+        let prior = Locality { source_points, target_points, max_distance };
+        index_pairs(&matching::mutual_nearest(&a, &b, Some(&prior)).unwrap())
+    };
+    let near = |i: usize, j: usize| (a.points()[i] - b.points()[j]).norm() < 0.6;
+    assert_eq!(found(0.6), brute_force_mutual(&a, &b, near));
+    assert!(!found(0.6).is_empty() && found(0.5).is_empty());
+}
+
+#[test]
 fn the_number_of_threads_changes_nothing() {
     let (a, b) = (random_features(1500, 48, 7), random_features(900, 48, 8));
     let on = |threads| {
@@ -189,23 +208,5 @@ proptest! {
         backward.sort_unstable();
         prop_assert_eq!(&forward, &backward);
         prop_assert_eq!(forward, brute_force_mutual(&a, &b, |_, _| true));
-    }
-}
-
-/// A measurement, not a check: `cargo test --release -- --ignored --nocapture speed`.
-#[test]
-#[ignore = "measures"]
-fn speed() {
-    for (count, dimension) in [(3000, 400), (1400, 384), (5000, 33), (20000, 33)] {
-        let (a, b) = (random_features(count, dimension, 1), random_features(count, dimension, 2));
-        let seconds = (0..10)
-            .map(|_| {
-                let start = std::time::Instant::now();
-                assert!(!matching::mutual_nearest(&a, &b, None).unwrap().is_empty());
-                start.elapsed().as_secs_f64()
-            })
-            .fold(f64::INFINITY, f64::min);
-        let speed = 2e-9 * (count * count * dimension) as f64 / seconds;
-        println!("{count} x {count} x {dimension}: {:.1} ms, {speed:.1} GFLOP/s", 1e3 * seconds);
     }
 }

@@ -1,10 +1,10 @@
 //! Steps 5 and 6 against the golden keypoints, samples, common points and fused features.
 
-use nalgebra::{Point3, Rotation3, Vector3};
+use nalgebra::Point3;
 use rare::data::DepthRange;
 use rare::fuse::fuse;
 use rare::transfer::{self, Sampling};
-use rare::{DepthMap, FeatureMap, Intrinsics, PointFeatures, RigidTransform};
+use rare::{DepthMap, FeatureMap, Intrinsics, PointFeatures};
 
 use crate::shared::{Array, Golden};
 
@@ -102,10 +102,10 @@ fn golden_fused_features() {
 #[test]
 fn pixels_of_which_nothing_is_known_are_left_out() {
     let intrinsics = Intrinsics { width: 6, height: 2, fx: 5.0, fy: 5.0, cx: 3.0, cy: 1.0 };
-    // One cell per pixel: depth unknown, too near, too far, feature zero, feature NaN, fine.
+    // One cell per pixel: depth unknown, too near, too far, feature NaN, feature zero, fine.
     let depth = [0.0, 0.01, 10.0, 2.0, 2.0, 2.0].repeat(2);
     let depth = DepthMap::new(intrinsics, depth).unwrap();
-    let features = [1.0, 1.0, 1.0, 0.0, f32::NAN, -3.0].repeat(2);
+    let features = [1.0, 1.0, 1.0, f32::NAN, 0.0, -3.0].repeat(2);
     let map = FeatureMap::new(1, 2, 6, features).unwrap();
     let lifted = transfer::lift(&map, &depth, DepthRange::indoor(), Sampling::AlignedCorners);
     assert_eq!(lifted.pixels, [(5, 0), (5, 1)]);
@@ -130,13 +130,19 @@ fn odd_sizes_do_not_panic() {
 }
 
 #[test]
-fn keypoints_move_between_frames_with_their_features() {
-    let pose = RigidTransform::new(
-        Rotation3::new(Vector3::new(0.1, -0.2, 0.3)),
-        Vector3::new(1.0, 2.0, 3.0),
-    );
-    let before = PointFeatures::new(vec![Point3::new(1.0, 0.0, 2.0)], 2, vec![0.6, 0.8]).unwrap();
-    let moved = before.clone().transformed(&pose);
-    assert_eq!(moved.points(), [pose.apply(&before.points()[0])]);
-    assert_eq!(moved.values(), before.values());
+fn own_cells_are_taken_as_they_are() {
+    let features = |intrinsics: Intrinsics, map: &FeatureMap| {
+        let depth = vec![2.0; intrinsics.width * intrinsics.height];
+        let depth = DepthMap::new(intrinsics, depth).unwrap();
+        let lifted = transfer::lift(map, &depth, DepthRange::indoor(), Sampling::OwnCell);
+        // The first of the two channels is 1: the second, divided by it, undoes the normalisation.
+        let rows = lifted.keypoints.values().chunks_exact(2);
+        rows.map(|row| (row[1] / row[0]).round()).collect::<Vec<f32>>()
+    };
+    let values = [1.0; 8].into_iter().chain((0..8).map(|cell| cell as f32)).collect();
+    let map = FeatureMap::new(2, 2, 4, values).unwrap();
+    let image = |width, height| Intrinsics { width, height, ..Intrinsics::indoor() };
+    assert_eq!(features(image(41, 25), &map), [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
+    // Fewer pixels than cells: the last cells of each row have no keypoint.
+    assert_eq!(features(image(3, 2), &map), [0.0, 1.0, 2.0, 4.0, 5.0, 6.0]);
 }
