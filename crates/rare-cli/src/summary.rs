@@ -77,13 +77,19 @@ pub(crate) fn describe_details(refinement: &Refinement) -> String {
     }
     text.push_str("decided from the clouds\n");
     row(&mut text, "scene", &kind_in_words(refinement.scale.kind));
-    row(&mut text, "voxel", &format!("{:.4} m", refinement.scale.voxel));
+    row(&mut text, "voxel", &short_length(refinement.scale.voxel));
     text.trim_end().to_owned()
 }
 
 /// The kind of scene as options name it.
 pub(crate) fn kind_in_words(kind: SceneKind) -> String {
     format!("{kind:?}").to_lowercase()
+}
+
+/// A length whose few digits hold for figurines and streets alike.
+pub(crate) fn short_length(metres: f64) -> String {
+    // Single precision prints 0.026 where double precision knows of 0.026000000000000002.
+    format!("{} m", metres as f32)
 }
 
 /// A name and its value, in columns.

@@ -11,7 +11,7 @@ use rare::{PointCloud, io as files};
 use crate::SUCCESS;
 use crate::args::InfoArgs;
 use crate::run::print;
-use crate::summary::{kind_in_words, row};
+use crate::summary::{kind_in_words, row, short_length};
 
 pub(super) fn run(args: &InfoArgs) -> Result<u8> {
     let texts = args.clouds.iter().map(|file| describe(file)).collect::<Result<Vec<String>>>()?;
@@ -31,7 +31,7 @@ fn describe(file: &Path) -> Result<String> {
     let scale = Scale::new(Profile::Auto, None, &cloud, &cloud)
         .with_context(|| file.display().to_string())?;
     row(&mut text, "scene", &kind_in_words(scale.kind));
-    row(&mut text, "voxel", &format!("{} m (automatic)", scale.voxel));
+    row(&mut text, "voxel", &format!("{} (automatic)", short_length(scale.voxel)));
     Ok(text)
 }
 

@@ -117,12 +117,18 @@ fn the_opposite_direction_is_the_inverse() {
     let back = rare::io::read_pose(workplace.path("back.txt")).unwrap();
     workplace.pose("initial.txt", &back.inverse());
     let pair = ["refine", "source.xyz", "reference.xyz", "--init", "back.txt"];
+    let outputs = ["--json", "out.json"];
     let direction = ["--init-direction", "target-to-source"];
-    let inverted = workplace.run(&[&pair[..], &direction].concat());
+    let inverted = workplace.run(&[&pair[..], &outputs, &direction].concat());
     assert_eq!(inverted.code, 0, "{inverted:?}");
     let difference = inverted.pose().error_to(&workplace.refine(&[]).pose());
     assert!(difference.translation < 1e-6, "{difference:?}");
-    assert_ne!(workplace.run(&pair).stdout, inverted.stdout);
+    let initial = |record: serde_json::Value| record["initial"][0][3].as_f64().unwrap();
+    let inverted_start = initial(workplace.json("out.json"));
+    assert!((inverted_start - forward.translation().x).abs() < 1e-12);
+    workplace.run(&[&pair[..], &outputs].concat());
+    let start = initial(workplace.json("out.json"));
+    assert!((start - forward.inverse().translation().x).abs() < 1e-12);
 }
 
 #[test]
@@ -141,7 +147,8 @@ fn georeferenced_clouds_move_the_same_to_the_millimetre() {
     let (near, far) = (run(Vector3::zeros()), run(utm));
     for point in &pair()[0][..20] {
         let moved = far.apply(&(point + utm)) - utm;
-        assert!((moved - near.apply(point)).norm() < 1e-3);
+        let apart = (moved - near.apply(point)).norm();
+        assert!(apart < 1e-3, "{apart}");
     }
     let aligned = rare::io::read_cloud(workplace.path("aligned.xyz")).unwrap().world_points();
     for (point, moved) in pair()[0].iter().zip(&aligned) {

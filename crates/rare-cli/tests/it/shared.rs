@@ -153,6 +153,10 @@ pub(crate) fn pair() -> [Vec<Point3<f64>>; 2] {
     [source, corner(2)]
 }
 
+/// Standard deviation of a coordinate, metres. Without noise the neighbours of a point lie in one plane exactly, and
+/// the last digit of a coordinate decides what their features are.
+const NOISE: f64 = 0.004;
+
 /// 8000 points on a wall, a floor, a side wall and three boxes, in a cube of 2.4 m around the origin.
 fn corner(seed: u64) -> Vec<Point3<f64>> {
     let mut random = rare::random::Random::new(seed, 0);
@@ -169,7 +173,8 @@ fn corner(seed: u64) -> Vec<Point3<f64>> {
     for (start, along, across, share) in sheets {
         for _ in 0..(8000.0 * share) as usize {
             let (u, v) = (random.uniform(), random.uniform());
-            let place = |i: usize| start[i] + u * along[i] + v * across[i];
+            let mut place =
+                |i: usize| start[i] + u * along[i] + v * across[i] + NOISE * random.normal();
             points.push(Point3::new(place(0), place(1), place(2)));
         }
     }
