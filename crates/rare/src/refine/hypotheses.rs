@@ -23,7 +23,7 @@ const POLISHED: usize = 2;
 /// Hypotheses taken from each set.
 const HYPOTHESES_PER_SET: usize = 2;
 /// Most pairs of a set in which consensus is sought; the best-scored ones.
-const MOST_PAIRS: usize = 2000;
+const MOST_PAIRS: usize = 1000;
 
 impl Candidate {
     pub(super) fn judged(target_from_source: RigidTransform, verifier: &Verifier<'_>) -> Candidate {
@@ -143,7 +143,7 @@ fn schedule(voxel: f64, reaches: &[f64]) -> Icp {
     Icp {
         kernel: RobustKernel::Tukey,
         stages: reaches.iter().map(stage).collect(),
-        max_iterations: 15,
+        max_iterations: 10,
         rotation_tolerance: 5e-4,
         translation_tolerance: 0.01 * voxel,
     }

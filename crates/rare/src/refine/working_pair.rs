@@ -163,9 +163,9 @@ fn in_units(points: &[Point3<f64>], unit: f64) -> Cow<'_, [Point3<f64>]> {
     }
 }
 
-/// Normals from 30 neighbours within two voxels.
+/// Normals from 20 neighbours within two voxels.
 fn surface(fine: &[Point3<f64>], scale: &Scale) -> Result<IcpTarget> {
-    let normals = estimate_normals(fine, &KdTree::new(fine), 2.0 * scale.voxel, 30);
+    let normals = estimate_normals(fine, &KdTree::new(fine), 2.0 * scale.voxel, 20);
     IcpTarget::new(fine.to_vec(), normals)
 }
 
