@@ -28,7 +28,7 @@ use crate::error::Result;
 use crate::scale::{Scale, SceneKind};
 use crate::transfer::Sampling;
 use crate::verify::{DepthConsistency, Verdict, Verifier, confidence};
-use crate::viewpoints::{self, Viewpoint};
+use crate::viewpoints::{self, CameraChoice, Viewpoint};
 
 /// Refines initial transforms between clouds.
 pub struct Refiner {
@@ -240,14 +240,17 @@ impl Refiner {
         Ok(clock.time("polish", || hypotheses::polish(pair, &ranked, verifier)))
     }
 
+    /// The paper sees a street through KITTI's colour camera; everything else chooses by the kind of scene.
     fn viewpoints(&self, pair: &WorkingPair<'_>, pose: &RigidTransform) -> Vec<Viewpoint> {
-        viewpoints::choose(
-            self.config.camera,
-            &pair.scale,
-            &pair.target.coarse,
-            &pair.source.coarse,
-            pose,
-        )
+        let camera = match self.config.camera {
+            CameraChoice::Auto if self.is_street_in_metres(pair) => CameraChoice::Kitti,
+            chosen => chosen,
+        };
+        viewpoints::choose(camera, &pair.scale, &pair.target.coarse, &pair.source.coarse, pose)
+    }
+
+    fn is_street_in_metres(&self, pair: &WorkingPair<'_>) -> bool {
+        self.config.recipe.metric && pair.scale.kind == SceneKind::Lidar
     }
 
     fn verifier<'a>(&self, pair: &'a WorkingPair<'_>, pose: &RigidTransform) -> Verifier<'a> {
@@ -261,8 +264,7 @@ impl Refiner {
 
     /// The recipe's filters: `fast` indoors and in working units, `multiscale` for streets in metres.
     fn densifier(&self, pair: &WorkingPair<'_>) -> Densifier {
-        let street = self.config.recipe.metric && pair.scale.kind == SceneKind::Lidar;
-        if street { Densifier::Multiscale } else { Densifier::Fast }
+        if self.is_street_in_metres(pair) { Densifier::Multiscale } else { Densifier::Fast }
     }
 
     fn encode(&self, pair: &WorkingPair<'_>, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {

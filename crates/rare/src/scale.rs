@@ -104,6 +104,16 @@ impl Scale {
         Scale::with_voxel(self.kind, self.voxel / unit)
     }
 
+    /// The paper's constants: 5 cm indoors and 30 cm for LiDAR (unless `voxel` is given), depths as FreeReg has them.
+    #[must_use]
+    pub fn of_paper(kind: SceneKind, voxel: Option<f64>) -> Scale {
+        let (customary, depth_range) = match kind {
+            SceneKind::Lidar => (0.3, DepthRange::kitti()),
+            SceneKind::Indoor | SceneKind::Object => (0.05, DepthRange::indoor()),
+        };
+        Scale { depth_range, ..Scale::with_voxel(kind, voxel.unwrap_or(customary)) }
+    }
+
     /// All lengths as multiples of a voxel size.
     #[must_use]
     pub fn with_voxel(kind: SceneKind, voxel: f64) -> Scale {

@@ -233,6 +233,6 @@ impl Verdict {
 /// `docs/measurements.md`); it is a first model, for ranking and for refusing what is clearly wrong.
 #[must_use]
 pub fn confidence(agreement: f64, overlap: f64, inlier_ratio: f64) -> f64 {
-    let evidence = -6.76 + 4.66 * agreement + 10.03 * overlap + 5.56 * inlier_ratio;
+    let evidence = -13.21 + 11.61 * agreement + 3.19 * overlap + 8.75 * inlier_ratio;
     1.0 / (1.0 + (-evidence).exp())
 }

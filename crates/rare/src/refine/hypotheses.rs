@@ -110,7 +110,7 @@ pub(super) fn polish(
     ranked: &[Candidate],
     verifier: &Verifier<'_>,
 ) -> Candidate {
-    let icp = schedule(pair.scale.voxel, &[3.0, 1.5]);
+    let icp = schedule(pair.scale.voxel, &[3.0, 1.5], 0.05);
     let polished = ranked.par_iter().take(POLISHED).filter_map(|candidate| {
         let start = &candidate.target_from_source;
         let aligned = icp.align(&pair.source.coarse, &pair.target_surface, start).ok()?;
@@ -128,7 +128,7 @@ pub(super) fn finish(
     best: &Candidate,
     verifier: &Verifier<'_>,
 ) -> Candidate {
-    let icp = schedule(pair.scale.voxel, &[1.0]);
+    let icp = schedule(pair.scale.voxel, &[1.0], 0.01);
     let Ok(aligned) = icp.align(&pair.source.fine, &pair.target_surface, &best.target_from_source)
     else {
         return *best;
@@ -137,14 +137,15 @@ pub(super) fn finish(
     if finished.consistency.score() >= best.consistency.score() { finished } else { *best }
 }
 
-/// Tukey point-to-plane within a few voxels, coarse to fine.
-fn schedule(voxel: f64, reaches: &[f64]) -> Icp {
+/// Tukey point-to-plane within a few voxels, coarse to fine, until steps are shorter than `tolerance` voxels.
+fn schedule(voxel: f64, reaches: &[f64], tolerance: f64) -> Icp {
     let stage = |reach: &f64| IcpStage { max_distance: reach * voxel, kernel_width: reach * voxel };
     Icp {
         kernel: RobustKernel::Tukey,
         stages: reaches.iter().map(stage).collect(),
         max_iterations: 10,
-        rotation_tolerance: 5e-4,
-        translation_tolerance: 0.01 * voxel,
+        // At the edge of a scan 30 voxels from its middle both count alike.
+        rotation_tolerance: tolerance / 30.0,
+        translation_tolerance: tolerance * voxel,
     }
 }

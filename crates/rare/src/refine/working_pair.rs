@@ -62,8 +62,12 @@ impl<'a> WorkingPair<'a> {
         check_shape("reference", &target.cloud)?;
         check_features(source, target)?;
         let metric = Scale::new(config.profile, config.voxel, &source.cloud, &target.cloud)?;
-        let unit = if config.recipe.metric { 1.0 } else { metric.voxel / WORKING_VOXEL };
-        let scale = metric.in_units(unit);
+        let (scale, unit) = if config.recipe.metric {
+            (Scale::of_paper(metric.kind, config.voxel), 1.0)
+        } else {
+            let unit = metric.voxel / WORKING_VOXEL;
+            (metric.in_units(unit), unit)
+        };
         let prepare = |scan, stream| WorkingCloud::new(scan, &scale, unit, config, stream);
         // The two sides take turns, not threads: each step inside is parallel already.
         let (source_side, target_side) = (prepare(source, 0)?, prepare(target, 1)?);
