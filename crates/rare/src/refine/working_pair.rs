@@ -152,8 +152,8 @@ impl<'a> WorkingCloud<'a> {
         stream: u64,
     ) -> Result<WorkingCloud<'a>> {
         let points = in_units(scan.cloud.points(), unit);
-        let coarse = voxel_downsample(&points, scale.voxel)?;
         let fine = voxel_downsample(&points, scale.voxel / 2.0)?;
+        let coarse = voxel_downsample(&fine, scale.voxel)?;
         let count = config.recipe.keypoints.unwrap_or(scale.keypoints);
         let mut random = Random::new(config.seed, stream);
         let keypoints = match &scan.features {
