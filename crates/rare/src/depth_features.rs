@@ -25,6 +25,16 @@ const THINNING: usize = 2;
 const BASELINE_PIXELS: (usize, usize) = (2, 16);
 
 /// The settings of the built-in encoder. Lengths are metres.
+///
+/// ```
+/// use rare::{DepthMap, Intrinsics, depth_features::DepthFeatures, encode::DepthEncoder};
+/// let intrinsics = Intrinsics { width: 80, height: 60, fx: 80.0, fy: 80.0, cx: 40.0, cy: 30.0 };
+/// let wall = DepthMap::new(intrinsics, vec![2.0; 80 * 60])?;
+/// let encoder = DepthFeatures::for_voxel(0.05);
+/// let layers = encoder.encode(&[wall])?.remove(0);
+/// assert_eq!((layers[0].channels(), layers[0].height(), layers[0].width()), (252, 6, 8));
+/// # Ok::<(), rare::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DepthFeatures {
     /// Pixels between neighbouring cells of the feature map.
@@ -176,7 +186,9 @@ fn nearest_pixel(position: f32, size: usize) -> usize {
 /// The low frequencies of the orthonormal cosine transform (DCT-II) along one side of a lattice.
 struct Cosines {
     lattice: usize,
-    /// `frequencies x lattice`.
+    /// Those whose indices add up to less are kept; may be more than the basis has.
+    frequencies: usize,
+    /// At most `lattice` frequencies, each `lattice` long.
     basis: Vec<f32>,
 }
 
@@ -188,15 +200,14 @@ impl Cosines {
             let angle = std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n;
             (scale * angle.cos()) as f32
         };
-        let frequencies = frequencies.min(lattice);
-        let basis = (0..frequencies).flat_map(|k| (0..lattice).map(move |i| value(k, i))).collect();
-        Cosines { lattice, basis }
+        let of_lattice = |frequency| (0..lattice).map(move |position| value(frequency, position));
+        let basis = (0..frequencies.min(lattice)).flat_map(of_lattice).collect();
+        Cosines { lattice, frequencies, basis }
     }
 
     /// Transforms a lattice of points; coefficients whose indices add up to less than the number of frequencies, each
     /// with all channels. `sums` is working memory, one row of the lattice.
     fn transform(&self, patch: &[[f32; CHANNELS]], sums: &mut [[f32; CHANNELS]], out: &mut [f32]) {
-        let frequencies = self.basis.len() / self.lattice;
         let mut out = out.chunks_exact_mut(CHANNELS);
         for (down, basis_down) in self.basis.chunks_exact(self.lattice).enumerate() {
             sums.fill([0.0; CHANNELS]);
@@ -205,7 +216,8 @@ impl Cosines {
                     add_scaled(sum, *weight, point);
                 }
             }
-            for basis_across in self.basis.chunks_exact(self.lattice).take(frequencies - down) {
+            for basis_across in self.basis.chunks_exact(self.lattice).take(self.frequencies - down)
+            {
                 let mut coefficient = [0.0; CHANNELS];
                 for (weight, sum) in basis_across.iter().zip(&*sums) {
                     add_scaled(&mut coefficient, *weight, sum);
@@ -293,5 +305,123 @@ impl<'a> Rays<'a> {
         let (x, y) = (self.x.get(u)?, self.y.get(v)?);
         let depth = *self.map.depth().get(v * self.map.width() + u)?;
         (depth > 0.0).then(|| Vector3::new(x * depth, y * depth, depth))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::Intrinsics;
+
+    const SIDE: usize = 210;
+
+    /// A hilly surface around 2 m of depth, seen by a camera that has moved forward by `forward` metres.
+    fn hills(forward: f64) -> DepthMap {
+        let centre = (SIDE / 2) as f64;
+        let intrinsics =
+            Intrinsics { width: SIDE, height: SIDE, fx: 240.0, fy: 240.0, cx: centre, cy: centre };
+        let surface =
+            |x: f64, y: f64| 2.0 + 0.06 * (9.0 * x).sin() * (7.0 * y + 0.4).cos() + 0.1 * x;
+        let depth = |pixel: usize| {
+            let at = |side: usize| (side as f64 - centre) / 240.0;
+            let (x, y) = (at(pixel % SIDE), at(pixel / SIDE));
+            (0..30).fold(2.0 - forward, |depth, _| surface(x * depth, y * depth) - forward) as f32
+        };
+        DepthMap::new(intrinsics, (0..SIDE * SIDE).map(depth).collect()).unwrap()
+    }
+
+    /// The descriptors of all cells, row by row.
+    fn descriptors(map: &DepthMap) -> Vec<Vec<f32>> {
+        let encoder = DepthFeatures::for_voxel(0.05);
+        let features = encoder.encode(std::slice::from_ref(map)).unwrap().remove(0).remove(0);
+        let cells = features.height() * features.width();
+        assert_eq!((features.channels(), cells), (encoder.dimension(), 21 * 21));
+        let channel = |cell: usize| features.values().iter().skip(cell).step_by(cells).copied();
+        (0..cells).map(|cell| channel(cell).collect()).collect()
+    }
+
+    /// The cell in the middle of the image: the point on the optical axis.
+    const MIDDLE: usize = 21 * 10 + 10;
+
+    fn similarity(a: &[f32], b: &[f32]) -> f32 {
+        a.iter().zip(b).map(|(a, b)| a * b).sum()
+    }
+
+    #[test]
+    fn the_dimension_counts_the_low_frequencies_of_all_lattices_and_channels() {
+        // 6 + 5 + 4 + 3 + 2 + 1 = 21 of 81.
+        assert_eq!(DepthFeatures::for_voxel(0.05).dimension(), 3 * 21 * 4);
+        let with = |lattice, frequencies| {
+            let settings = DepthFeatures::for_voxel(0.05);
+            DepthFeatures { lattice, frequencies, radii: vec![0.1], ..settings }
+        };
+        // Not more frequencies than points: 3 + 3 + 3, or 3 + 2 + 1.
+        assert_eq!((with(3, 9).coefficients(), with(3, 3).coefficients()), (9, 6));
+        assert_eq!(with(3, 9).dimension(), 9 * 4);
+        let map = hills(0.0);
+        for settings in [with(3, 9), with(3, 4), with(5, 1)] {
+            let features = settings.encode(std::slice::from_ref(&map)).unwrap().remove(0).remove(0);
+            let last = features.channel(settings.dimension() - CHANNELS).unwrap();
+            assert!(last.iter().any(|&value| value != 0.0), "{settings:?}: no last coefficient");
+        }
+    }
+
+    #[test]
+    fn descriptors_have_unit_length_and_cells_without_depth_none() {
+        let mut map = hills(0.0);
+        let holes = [105 * SIDE + 105, 5 * SIDE + 205];
+        for pixel in holes {
+            map.depth_mut()[pixel] = 0.0;
+        }
+        for (cell, descriptor) in descriptors(&map).iter().enumerate() {
+            let norm = similarity(descriptor, descriptor).sqrt();
+            let expected = if [MIDDLE, 20].contains(&cell) { 0.0 } else { 1.0 };
+            assert!((norm - expected).abs() < 1e-4, "{cell}: {norm}");
+        }
+        let empty = descriptors(&DepthMap::empty(*map.intrinsics()));
+        assert!(empty.iter().flatten().all(|&value| value == 0.0));
+    }
+
+    #[test]
+    fn a_place_looks_the_same_from_nearer_by() {
+        let (far, near) = (descriptors(&hills(0.0)), descriptors(&hills(0.5)));
+        let same = similarity(&far[MIDDLE], &near[MIDDLE]);
+        let other = similarity(&far[MIDDLE], &near[MIDDLE + 4]);
+        assert!(same > 0.97 && other < same - 0.05, "{same} {other}");
+        let nearest = |cells: &[Vec<f32>]| {
+            let to = |cell: &usize| similarity(&far[MIDDLE], &cells[*cell]);
+            (0..cells.len()).max_by(|a, b| to(a).total_cmp(&to(b)))
+        };
+        assert_eq!(nearest(&near), Some(MIDDLE));
+    }
+
+    #[test]
+    fn holes_neither_attract_nor_repel() {
+        let (whole, mut holed) = (hills(0.0), hills(0.0));
+        // Right of the middle nothing is seen: two fifths of the largest lattice.
+        for row in holed.depth_mut().chunks_exact_mut(SIDE) {
+            row[112..].fill(0.0);
+        }
+        let (whole, holed) = (descriptors(&whole), descriptors(&holed));
+        let same = similarity(&whole[MIDDLE], &holed[MIDDLE]);
+        assert!(same > 0.7, "{same}");
+        // What is missing in one of two patches adds nothing: the similarity is that of the seen part.
+        let both = similarity(&holed[MIDDLE], &holed[MIDDLE]);
+        assert!((both - 1.0).abs() < 1e-4, "{both}");
+    }
+
+    #[test]
+    fn settings_that_make_no_sense_are_refused() {
+        let good = || DepthFeatures::for_voxel(0.05);
+        for bad in [
+            DepthFeatures { stride: 0, ..good() },
+            DepthFeatures { lattice: 1, ..good() },
+            DepthFeatures { frequencies: 0, ..good() },
+            DepthFeatures { radii: Vec::new(), ..good() },
+        ] {
+            let message = bad.encode(&[]).unwrap_err().to_string();
+            assert!(message.contains("make no sense"), "{message}");
+        }
+        assert!(good().encode(&[]).unwrap().is_empty());
     }
 }
