@@ -7,11 +7,13 @@
 //! transform over the lattice are kept: they carry the similarity of the patches in a quarter of the numbers. Both maps
 //! of a view come from the same virtual camera with a small parallax, which makes upright descriptors fair.
 
-use nalgebra::Vector3;
+mod surface;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::data::{DepthMap, FeatureMap, LayeredFeatures};
+use crate::depth_features::surface::{Surface, THINNING};
 use crate::encode::DepthEncoder;
 use crate::error::{Error, Result};
 
@@ -19,12 +21,18 @@ use crate::error::{Error, Result};
 const CHANNELS: usize = 4;
 /// Surfaces further before or behind the centre than this many lattice radii show no normal.
 const NORMAL_REACH: f32 = 1.5;
-/// Lattices sample every so many pixels at the finest.
-const THINNING: usize = 2;
-/// The smallest and the largest half baseline of a normal, pixels.
-const BASELINE_PIXELS: (usize, usize) = (2, 16);
 
 /// The settings of the built-in encoder. Lengths are metres.
+///
+/// ```
+/// use rare::{DepthMap, Intrinsics, depth_features::DepthFeatures, encode::DepthEncoder};
+/// let intrinsics = Intrinsics { width: 80, height: 60, fx: 80.0, fy: 80.0, cx: 40.0, cy: 30.0 };
+/// let wall = DepthMap::new(intrinsics, vec![2.0; 80 * 60])?;
+/// let encoder = DepthFeatures::for_voxel(0.05);
+/// let layers = encoder.encode(&[wall])?.remove(0);
+/// assert_eq!((layers[0].channels(), layers[0].height(), layers[0].width()), (252, 6, 8));
+/// # Ok::<(), rare::Error>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DepthFeatures {
     /// Pixels between neighbouring cells of the feature map.
@@ -176,7 +184,9 @@ fn nearest_pixel(position: f32, size: usize) -> usize {
 /// The low frequencies of the orthonormal cosine transform (DCT-II) along one side of a lattice.
 struct Cosines {
     lattice: usize,
-    /// `frequencies x lattice`.
+    /// Those whose indices add up to less are kept; may be more than the basis has.
+    frequencies: usize,
+    /// At most `lattice` frequencies, each `lattice` long.
     basis: Vec<f32>,
 }
 
@@ -188,15 +198,14 @@ impl Cosines {
             let angle = std::f64::consts::PI * (position as f64 + 0.5) * frequency as f64 / n;
             (scale * angle.cos()) as f32
         };
-        let frequencies = frequencies.min(lattice);
-        let basis = (0..frequencies).flat_map(|k| (0..lattice).map(move |i| value(k, i))).collect();
-        Cosines { lattice, basis }
+        let of_lattice = |frequency| (0..lattice).map(move |position| value(frequency, position));
+        let basis = (0..frequencies.min(lattice)).flat_map(of_lattice).collect();
+        Cosines { lattice, frequencies, basis }
     }
 
     /// Transforms a lattice of points; coefficients whose indices add up to less than the number of frequencies, each
     /// with all channels. `sums` is working memory, one row of the lattice.
     fn transform(&self, patch: &[[f32; CHANNELS]], sums: &mut [[f32; CHANNELS]], out: &mut [f32]) {
-        let frequencies = self.basis.len() / self.lattice;
         let mut out = out.chunks_exact_mut(CHANNELS);
         for (down, basis_down) in self.basis.chunks_exact(self.lattice).enumerate() {
             sums.fill([0.0; CHANNELS]);
@@ -205,7 +214,8 @@ impl Cosines {
                     add_scaled(sum, *weight, point);
                 }
             }
-            for basis_across in self.basis.chunks_exact(self.lattice).take(frequencies - down) {
+            for basis_across in self.basis.chunks_exact(self.lattice).take(self.frequencies - down)
+            {
                 let mut coefficient = [0.0; CHANNELS];
                 for (weight, sum) in basis_across.iter().zip(&*sums) {
                     add_scaled(&mut coefficient, *weight, sum);
@@ -224,74 +234,121 @@ fn add_scaled(sum: &mut [f32; CHANNELS], weight: f32, point: &[f32; CHANNELS]) {
     }
 }
 
-/// What is seen at every second pixel of a depth map: the unit normal in the camera's frame (zero where a neighbour is
-/// missing), then the depth. Lattices are coarser than that, and a quarter of the pixels stays in the cache.
-struct Surface<'a> {
-    map: &'a DepthMap,
-    width: usize,
-    height: usize,
-    pixels: Vec<[f32; CHANNELS]>,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::Intrinsics;
 
-impl<'a> Surface<'a> {
-    fn new(map: &'a DepthMap, baseline: f64) -> Surface<'a> {
-        let (width, height) = (map.width().div_ceil(THINNING), map.height().div_ceil(THINNING));
-        let mut pixels = vec![[0.0; CHANNELS]; width * height];
-        let focal_baseline = (baseline * map.intrinsics().fx) as f32;
-        let rays = Rays::new(map);
-        let (least, most) = BASELINE_PIXELS;
-        for (row, pixels) in pixels.chunks_exact_mut(width.max(1)).enumerate() {
-            for (column, pixel) in pixels.iter_mut().enumerate() {
-                let (u, v) = (column * THINNING, row * THINNING);
-                let depth = map.at(u, v);
-                if depth > 0.0 {
-                    let step = ((focal_baseline / depth) as usize).clamp(least, most);
-                    let [x, y, z] = rays.normal(u, v, step).unwrap_or([0.0; 3]);
-                    *pixel = [x, y, z, depth];
-                }
-            }
-        }
-        Surface { map, width, height, pixels }
-    }
+    const SIDE: usize = 210;
 
-    fn row(&self, row: usize) -> &[[f32; CHANNELS]] {
-        &self.pixels[row * self.width..(row + 1) * self.width]
-    }
-}
-
-/// The viewing rays of a map's columns and rows, at depth 1.
-struct Rays<'a> {
-    map: &'a DepthMap,
-    x: Vec<f32>,
-    y: Vec<f32>,
-}
-
-impl<'a> Rays<'a> {
-    fn new(map: &'a DepthMap) -> Rays<'a> {
-        let camera = map.intrinsics();
-        let axis = |size, centre: f64, focal: f64| {
-            (0..size).map(|i| ((i as f64 - centre) / focal) as f32).collect()
+    /// A hilly surface around 2 m of depth, seen by a camera that has moved forward by `forward` metres.
+    fn hills(forward: f64) -> DepthMap {
+        let centre = (SIDE / 2) as f64;
+        let intrinsics =
+            Intrinsics { width: SIDE, height: SIDE, fx: 240.0, fy: 240.0, cx: centre, cy: centre };
+        let surface =
+            |x: f64, y: f64| 2.0 + 0.06 * (9.0 * x).sin() * (7.0 * y + 0.4).cos() + 0.1 * x;
+        let depth = |pixel: usize| {
+            let at = |side: usize| (side as f64 - centre) / 240.0;
+            let (x, y) = (at(pixel % SIDE), at(pixel / SIDE));
+            (0..30).fold(2.0 - forward, |depth, _| surface(x * depth, y * depth) - forward) as f32
         };
-        Rays {
-            map,
-            x: axis(map.width(), camera.cx, camera.fx),
-            y: axis(map.height(), camera.cy, camera.fy),
+        DepthMap::new(intrinsics, (0..SIDE * SIDE).map(depth).collect()).unwrap()
+    }
+
+    /// The descriptors of all cells, row by row.
+    fn descriptors(map: &DepthMap) -> Vec<Vec<f32>> {
+        let encoder = DepthFeatures::for_voxel(0.05);
+        let features = encoder.encode(std::slice::from_ref(map)).unwrap().remove(0).remove(0);
+        let cells = features.height() * features.width();
+        assert_eq!((features.channels(), cells), (encoder.dimension(), 21 * 21));
+        let channel = |cell: usize| features.values().iter().skip(cell).step_by(cells).copied();
+        (0..cells).map(|cell| channel(cell).collect()).collect()
+    }
+
+    /// The cell in the middle of the image: the point on the optical axis.
+    const MIDDLE: usize = 21 * 10 + 10;
+
+    fn similarity(a: &[f32], b: &[f32]) -> f32 {
+        a.iter().zip(b).map(|(a, b)| a * b).sum()
+    }
+
+    #[test]
+    fn the_dimension_counts_the_low_frequencies_of_all_lattices_and_channels() {
+        // 6 + 5 + 4 + 3 + 2 + 1 = 21 of 81.
+        assert_eq!(DepthFeatures::for_voxel(0.05).dimension(), 3 * 21 * 4);
+        let with = |lattice, frequencies| {
+            let settings = DepthFeatures::for_voxel(0.05);
+            DepthFeatures { lattice, frequencies, radii: vec![0.1], ..settings }
+        };
+        // Not more frequencies than points: 3 + 3 + 3, or 3 + 2 + 1.
+        assert_eq!((with(3, 9).coefficients(), with(3, 3).coefficients()), (9, 6));
+        assert_eq!(with(3, 9).dimension(), 9 * 4);
+        let map = hills(0.0);
+        for settings in [with(3, 9), with(3, 4), with(5, 1)] {
+            let features = settings.encode(std::slice::from_ref(&map)).unwrap().remove(0).remove(0);
+            let last = features.channel(settings.dimension() - CHANNELS).unwrap();
+            assert!(last.iter().any(|&value| value != 0.0), "{settings:?}: no last coefficient");
         }
     }
 
-    /// The normal from the four neighbours `step` pixels away; `None` at the border and beside holes.
-    fn normal(&self, u: usize, v: usize, step: usize) -> Option<[f32; 3]> {
-        let (left, top) = (u.checked_sub(step)?, v.checked_sub(step)?);
-        let across = self.point(u + step, v)? - self.point(left, v)?;
-        let down = self.point(u, v + step)? - self.point(u, top)?;
-        let normal = across.cross(&down);
-        let length = normal.norm();
-        (length > 0.0).then(|| (normal / length).into())
+    #[test]
+    fn descriptors_have_unit_length_and_cells_without_depth_none() {
+        let mut map = hills(0.0);
+        let holes = [105 * SIDE + 105, 5 * SIDE + 205];
+        for pixel in holes {
+            map.depth_mut()[pixel] = 0.0;
+        }
+        for (cell, descriptor) in descriptors(&map).iter().enumerate() {
+            let norm = similarity(descriptor, descriptor).sqrt();
+            let expected = if [MIDDLE, 20].contains(&cell) { 0.0 } else { 1.0 };
+            assert!((norm - expected).abs() < 1e-4, "{cell}: {norm}");
+        }
+        let empty = descriptors(&DepthMap::empty(*map.intrinsics()));
+        assert!(empty.iter().flatten().all(|&value| value == 0.0));
     }
 
-    fn point(&self, u: usize, v: usize) -> Option<Vector3<f32>> {
-        let (x, y) = (self.x.get(u)?, self.y.get(v)?);
-        let depth = *self.map.depth().get(v * self.map.width() + u)?;
-        (depth > 0.0).then(|| Vector3::new(x * depth, y * depth, depth))
+    #[test]
+    fn a_place_looks_the_same_from_nearer_by() {
+        let (far, near) = (descriptors(&hills(0.0)), descriptors(&hills(0.5)));
+        let same = similarity(&far[MIDDLE], &near[MIDDLE]);
+        let other = similarity(&far[MIDDLE], &near[MIDDLE + 4]);
+        assert!(same > 0.97 && other < same - 0.05, "{same} {other}");
+        let nearest = |cells: &[Vec<f32>]| {
+            let to = |cell: &usize| similarity(&far[MIDDLE], &cells[*cell]);
+            (0..cells.len()).max_by(|a, b| to(a).total_cmp(&to(b)))
+        };
+        assert_eq!(nearest(&near), Some(MIDDLE));
+    }
+
+    #[test]
+    fn holes_neither_attract_nor_repel() {
+        let (whole, mut holed) = (hills(0.0), hills(0.0));
+        // Right of the middle nothing is seen: two fifths of the largest lattice.
+        for row in holed.depth_mut().chunks_exact_mut(SIDE) {
+            row[112..].fill(0.0);
+        }
+        let (whole, holed) = (descriptors(&whole), descriptors(&holed));
+        let same = similarity(&whole[MIDDLE], &holed[MIDDLE]);
+        assert!(same > 0.7, "{same}");
+        // Two places with the same hole at their side are no more alike than before.
+        let alike = |cells: &[Vec<f32>]| similarity(&cells[MIDDLE], &cells[MIDDLE - 21 * 5]);
+        println!("{same} {} {}", alike(&whole), alike(&holed));
+        assert!(alike(&holed) < alike(&whole) + 0.05, "{} {}", alike(&whole), alike(&holed));
+    }
+
+    #[test]
+    fn settings_that_make_no_sense_are_refused() {
+        let good = || DepthFeatures::for_voxel(0.05);
+        for bad in [
+            DepthFeatures { stride: 0, ..good() },
+            DepthFeatures { lattice: 1, ..good() },
+            DepthFeatures { frequencies: 0, ..good() },
+            DepthFeatures { radii: Vec::new(), ..good() },
+        ] {
+            let message = bad.encode(&[]).unwrap_err().to_string();
+            assert!(message.contains("make no sense"), "{message}");
+        }
+        assert!(good().encode(&[]).unwrap().is_empty());
     }
 }

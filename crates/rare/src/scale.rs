@@ -207,3 +207,174 @@ fn two_digits(value: f64) -> f64 {
     let unit = 10_f64.powf(value.log10().floor() - 1.0);
     (value / unit).round() * unit
 }
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::TAU;
+
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::random::Random;
+
+    fn cloud(mut point: impl FnMut(&mut Random) -> Point3<f64>) -> PointCloud {
+        let mut random = Random::new(1, 0);
+        PointCloud::new((0..4000).map(|_| point(&mut random)).collect()).unwrap()
+    }
+
+    /// A wall and a floor before a depth camera.
+    fn seen_by_a_camera() -> PointCloud {
+        cloud(|random| {
+            let z = 1.0 + 2.0 * random.uniform();
+            Point3::new((random.uniform() - 0.5) * z, (random.uniform() - 0.5) * 0.8 * z, z)
+        })
+    }
+
+    /// Walls all around a scanner, 5 to 25 m away.
+    fn around_a_scanner() -> PointCloud {
+        cloud(|random| {
+            let (angle, range) = (TAU * random.uniform(), 5.0 + 20.0 * random.uniform());
+            Point3::new(range * angle.cos(), range * angle.sin(), 3.0 * random.uniform() - 1.5)
+        })
+    }
+
+    /// A ball of 10 cm beside the origin.
+    fn object() -> PointCloud {
+        cloud(|random| {
+            let direction = Vector3::from_fn(|_, _| random.normal()).normalize();
+            Point3::new(0.5, 0.4, 0.1) + direction * 0.1
+        })
+    }
+
+    fn moved(cloud: &PointCloud, by: Vector3<f64>) -> PointCloud {
+        PointCloud::new(cloud.points().iter().map(|point| point + by).collect()).unwrap()
+    }
+
+    #[test]
+    fn the_kind_shows_in_where_the_points_lie() {
+        assert_eq!(SceneKind::detect(&seen_by_a_camera()), SceneKind::Indoor);
+        assert_eq!(SceneKind::detect(&around_a_scanner()), SceneKind::Lidar);
+        assert_eq!(SceneKind::detect(&object()), SceneKind::Object);
+        // Behind the camera there is no frustum, and a recentred cloud has no sensor at its origin.
+        let behind = moved(&seen_by_a_camera(), Vector3::new(3.0, 0.0, -6.0));
+        assert_eq!(SceneKind::detect(&behind), SceneKind::Object);
+        for cloud in [seen_by_a_camera(), around_a_scanner()] {
+            let far = moved(&cloud, Vector3::new(5e5, 5e6, 0.0));
+            assert_eq!(SceneKind::detect(&far), SceneKind::Object);
+        }
+    }
+
+    #[test]
+    fn clouds_of_different_kinds_are_objects() {
+        let kind = |source: &PointCloud, target: &PointCloud| {
+            Scale::new(Profile::Auto, None, source, target).unwrap().kind
+        };
+        let (camera, scanner) = (seen_by_a_camera(), around_a_scanner());
+        assert_eq!(kind(&camera, &camera), SceneKind::Indoor);
+        assert_eq!(kind(&camera, &scanner), SceneKind::Object);
+    }
+
+    #[test]
+    fn all_lengths_are_multiples_of_the_voxel() {
+        for (kind, common_point, keypoints) in [
+            (SceneKind::Indoor, 1.0, 500),
+            (SceneKind::Lidar, 5.0 / 3.0, 1000),
+            (SceneKind::Object, 1.0, 500),
+        ] {
+            let scale = Scale::with_voxel(kind, 0.3);
+            let in_voxels = |length: f64| length / 0.3;
+            assert!((in_voxels(scale.acceptance_radius) - 2.0).abs() < 1e-12);
+            assert!((in_voxels(scale.common_point_distance) - common_point).abs() < 1e-12);
+            assert!((in_voxels(scale.depth_range.min) - 0.2).abs() < 1e-12);
+            assert!((in_voxels(scale.depth_range.max) - 300.0).abs() < 1e-9);
+            assert_eq!((scale.kind, scale.keypoints), (kind, keypoints));
+            assert_eq!(scale.in_units(6.0), Scale::with_voxel(kind, 0.3 / 6.0));
+        }
+    }
+
+    #[test]
+    fn a_given_voxel_precedes_the_profile_and_the_profile_the_cloud() {
+        let cloud = object();
+        let scale = |profile, voxel| Scale::new(profile, voxel, &cloud, &cloud).unwrap();
+        for (profile, kind, voxel) in [
+            (Profile::Indoor, SceneKind::Indoor, 0.05),
+            (Profile::Lidar, SceneKind::Lidar, 0.3),
+            // 5 % of the ball's radius of 10 cm, until a voxel holds more than a point.
+            (Profile::Object, SceneKind::Object, scale(Profile::Auto, None).voxel),
+        ] {
+            assert_eq!(scale(profile, None), Scale::with_voxel(kind, voxel));
+            assert_eq!(scale(profile, Some(0.017)), Scale::with_voxel(kind, 0.017));
+        }
+    }
+
+    #[test]
+    fn a_voxel_without_a_length_is_refused() {
+        let cloud = object();
+        for voxel in [0.0, -0.05, f64::NAN, f64::INFINITY] {
+            let message = Scale::new(Profile::Auto, Some(voxel), &cloud, &cloud).unwrap_err();
+            assert!(message.to_string().contains(&format!("{voxel}")), "{message}");
+        }
+        let one_place = PointCloud::new(vec![Point3::new(1.0, 2.0, 3.0); 10]).unwrap();
+        let message = Scale::new(Profile::Auto, None, &cloud, &one_place).unwrap_err();
+        assert!(message.to_string().contains("identical"), "{message}");
+    }
+
+    #[test]
+    fn the_automatic_voxel_follows_the_size_of_the_scene() {
+        for cloud in [seen_by_a_camera(), around_a_scanner(), object()] {
+            let large = cloud.points().iter().map(|point| point * 1000.0).collect();
+            // No recentring: a scanner's cloud stays one in millimetres only while its middle is near the origin.
+            let large = PointCloud::new(large).unwrap();
+            let small = Scale::new(Profile::Auto, None, &cloud, &cloud).unwrap();
+            let large = Scale::new(Profile::Auto, None, &large, &large).unwrap();
+            assert_eq!(large.kind, small.kind);
+            assert!((large.voxel / small.voxel - 1000.0).abs() < 1e-6, "{small:?} {large:?}");
+        }
+    }
+
+    #[test]
+    fn the_automatic_voxel_is_a_share_of_the_scene() {
+        // Dense: every point many times, so that no voxel is too small to average some.
+        let dense = |cloud: PointCloud| PointCloud::new(cloud.points().repeat(2)).unwrap();
+        let (ball, scanner) = (dense(object()), dense(around_a_scanner()));
+        let voxel = |source, target| Scale::new(Profile::Auto, None, source, target).unwrap().voxel;
+        assert!((voxel(&ball, &ball) - 0.05 * 0.1).abs() < 1e-9, "{}", voxel(&ball, &ball));
+        // Ranges are uniform from 5 m to 25 m.
+        assert!((voxel(&scanner, &scanner) - 0.02 * 15.0).abs() < 0.011);
+        let half = PointCloud::new(ball.points().iter().map(|p| p * 0.5).collect()).unwrap();
+        assert!((voxel(&ball, &half) - 0.0025).abs() < 1e-9);
+        assert_eq!(voxel(&ball, &half), voxel(&half, &ball));
+    }
+
+    #[test]
+    fn voxels_of_a_sparse_cloud_grow_until_they_average_points() {
+        let sparse: Vec<_> = object().points().iter().step_by(40).copied().collect();
+        let sparse = PointCloud::new(sparse).unwrap();
+        let voxel = Scale::new(Profile::Auto, None, &sparse, &object()).unwrap().voxel;
+        let kept = |voxel| voxel_downsample(sparse.points(), voxel).unwrap().len();
+        assert!(kept(0.05 * 0.1) > 90, "the test needs a sparse cloud");
+        assert!(kept(voxel) <= 92 && voxel < 0.05, "{voxel}: {}", kept(voxel));
+    }
+
+    #[test]
+    fn the_papers_constants_do_not_depend_on_the_clouds() {
+        let indoor = Scale::of_paper(SceneKind::Indoor, None);
+        assert_eq!((indoor.voxel, indoor.acceptance_radius), (0.05, 0.1));
+        assert_eq!(indoor.depth_range, DepthRange { min: 0.01, max: 10.0 });
+        let lidar = Scale::of_paper(SceneKind::Lidar, None);
+        assert_eq!((lidar.voxel, lidar.acceptance_radius), (0.3, 0.6));
+        assert!((lidar.common_point_distance - 0.5).abs() < 1e-12);
+        assert_eq!(lidar.depth_range, DepthRange { min: 0.5, max: 80.0 });
+        assert_eq!(Scale::of_paper(SceneKind::Lidar, Some(0.2)).acceptance_radius, 0.4);
+    }
+
+    #[test]
+    fn two_digits_are_kept() {
+        for (value, kept) in [(0.0347, 0.035), (1234.0, 1200.0), (0.0996, 0.1), (7.0, 7.0)] {
+            assert!((two_digits(value) - kept).abs() < 1e-12 * kept, "{value}");
+        }
+        for value in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+            assert_eq!(two_digits(value), 0.0);
+        }
+    }
+}

@@ -236,3 +236,139 @@ pub fn confidence(agreement: f64, overlap: f64, inlier_ratio: f64) -> f64 {
     let evidence = -13.21 + 11.61 * agreement + 3.19 * overlap + 8.75 * inlier_ratio;
     1.0 / (1.0 + (-evidence).exp())
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Rotation3, Vector3};
+
+    use super::*;
+    use crate::data::Camera;
+
+    /// A plane at depth `z` that fills 16 x 12 pixels, one point per shrunk pixel, left of column `until`.
+    fn plane(z: f64, until: usize) -> Vec<Point3<f64>> {
+        let camera = shrunk(&viewpoint(Frame::Reference)).camera.intrinsics;
+        let columns = |v: usize| (0..until).map(move |u| (u as f64, v as f64));
+        (0..camera.height)
+            .flat_map(columns)
+            .map(|(u, v)| camera.back_project(u + 0.25, v + 0.25, z))
+            .collect()
+    }
+
+    /// A camera at the origin, 64 x 48 pixels: 16 x 12 of the pixels that are compared.
+    fn viewpoint(frame: Frame) -> Viewpoint {
+        let intrinsics =
+            Intrinsics { width: 64, height: 48, fx: 64.0, fy: 64.0, cx: 32.0, cy: 24.0 };
+        let camera = Camera { intrinsics, camera_from_world: RigidTransform::identity() };
+        Viewpoint { frame, camera }
+    }
+
+    fn along_z(by: f64) -> RigidTransform {
+        RigidTransform::from_translation(Vector3::new(0.0, 0.0, by))
+    }
+
+    #[test]
+    fn pixels_are_counted_by_who_stands_in_front() {
+        // The source covers 5 of 8 columns that the reference shows, or 5 of 16 the other way round.
+        let (reference, source) = (plane(2.0, 8), plane(2.0, 5));
+        let counts = |frame, pose: &RigidTransform| {
+            Verifier::new(&reference, &source, &[viewpoint(frame)], 0.05).consistency(pose)
+        };
+        // The tolerance is 5 cm and 2 % of 2 m.
+        for by in [0.085, -0.085] {
+            // The plane looks larger or smaller: some of its points change their pixels.
+            let seen = counts(Frame::Reference, &along_z(by));
+            assert!(seen.agree > 40, "{by}: {seen:?}");
+            assert_eq!((seen.occluded, seen.violation, seen.seen), (0, 0, 96), "{by}");
+        }
+        let exact = counts(Frame::Reference, &RigidTransform::identity());
+        assert_eq!(exact, DepthConsistency { agree: 60, occluded: 0, violation: 0, seen: 96 });
+        let behind = counts(Frame::Reference, &along_z(0.1));
+        assert_eq!((behind.agree, behind.violation), (0, 0));
+        assert!(behind.occluded > 40, "{behind:?}");
+        let before = counts(Frame::Reference, &along_z(-0.1));
+        assert_eq!((before.agree, before.occluded), (0, 0));
+        assert!(before.violation > 40, "{before:?}");
+        // From the source's side the roles change, and the reference moves by the inverse.
+        let other = counts(Frame::Source, &along_z(0.1));
+        assert_eq!((other.agree, other.occluded, other.seen), (0, 0, 60));
+        assert!(other.violation > 40, "{other:?}");
+    }
+
+    #[test]
+    fn the_counts_of_all_cameras_add_up() {
+        let (reference, source) = (plane(2.0, 8), plane(2.0, 5));
+        let both = [viewpoint(Frame::Reference), viewpoint(Frame::Source)];
+        let consistency = |views: &[Viewpoint]| {
+            Verifier::new(&reference, &source, views, 0.05).consistency(&along_z(0.01))
+        };
+        let (first, second) = (consistency(&both[..1]), consistency(&both[1..]));
+        let sum = consistency(&both);
+        assert_eq!(sum.agree, first.agree + second.agree);
+        assert_eq!(sum.seen, 96 + 60);
+        assert_eq!(consistency(&[]), DepthConsistency::default());
+    }
+
+    #[test]
+    fn shares_and_score_follow_the_counts() {
+        let counts = DepthConsistency { agree: 30, occluded: 7, violation: 10, seen: 60 };
+        assert_eq!((counts.score(), counts.agreement(), counts.coverage()), (10.0, 0.75, 0.5));
+        let nothing = DepthConsistency::default();
+        assert_eq!((nothing.score(), nothing.agreement(), nothing.coverage()), (0.0, 0.0, 0.0));
+    }
+
+    #[test]
+    fn overlap_is_the_share_of_source_points_near_the_reference() {
+        let reference = KdTree::new(&[Point3::new(1.0, 0.0, 0.0), Point3::new(5.0, 0.0, 0.0)]);
+        let source = [0.0, 0.09, 0.11, 4.0, 9.0].map(|x| Point3::new(x, 0.0, 0.0));
+        let found =
+            overlap(&reference, &source, &RigidTransform::from_translation(Vector3::x()), 0.1, 1.0);
+        assert_eq!(found.share, 0.6);
+        assert_eq!(found.information[(0, 0)], 3.0);
+        let nothing = overlap(&reference, &[], &RigidTransform::identity(), 0.1, 1.0);
+        assert_eq!((nothing.share, nothing.information), (0.0, Matrix6::zeros()));
+    }
+
+    /// `G = [I | -[p]x]` written out for the moved point, as 3DMatch's evaluation has it.
+    #[test]
+    fn the_information_of_a_point_is_that_of_3dmatch() {
+        let pose = RigidTransform::new(Rotation3::new(Vector3::new(0.3, -0.2, 0.9)), Vector3::x());
+        let source = Point3::new(0.2, 1.4, -0.7);
+        let (moved, unit) = (pose.apply(&source), 0.5);
+        let (x, y, z) = (moved.x * unit, moved.y * unit, moved.z * unit);
+        #[rustfmt::skip]
+        let g = Matrix3x6::new(
+            1.0, 0.0, 0.0, 0.0, z, -y,
+            0.0, 1.0, 0.0, -z, 0.0, x,
+            0.0, 0.0, 1.0, y, -x, 0.0,
+        );
+        let found = overlap(&KdTree::new(&[moved]), &[source], &pose, 0.1, unit).information;
+        assert!((found - g.transpose() * g).abs().max() < 1e-12, "{found}");
+        assert_eq!(found, found.transpose());
+        // A small twist moves the point by G times it: the rows and columns are translation first.
+        let turned = Rotation3::new(Vector3::new(1e-6, 2e-6, -1e-6)) * Point3::new(x, y, z);
+        let step = g * nalgebra::Vector6::new(0.0, 0.0, 0.0, 1e-6, 2e-6, -1e-6);
+        assert!((turned - Point3::new(x, y, z) - step).norm() < 1e-11);
+    }
+
+    #[test]
+    fn the_verdict_follows_the_confidence_first() {
+        assert_eq!(Verdict::of(REJECT_BELOW - 1e-9, false), Verdict::Rejected);
+        assert_eq!(Verdict::of(REJECT_BELOW - 1e-9, true), Verdict::Rejected);
+        assert_eq!(Verdict::of(REJECT_BELOW, true), Verdict::KeptInitial);
+        assert_eq!(Verdict::of(REJECT_BELOW, false), Verdict::Refined);
+    }
+
+    #[test]
+    fn every_kind_of_evidence_adds_confidence() {
+        let steps = || (0..=4).map(|step| f64::from(step) / 4.0);
+        for (a, b) in steps().flat_map(|a| steps().map(move |b| (a, b))) {
+            for less in steps().take(4) {
+                let more = less + 0.25;
+                assert!(confidence(more, a, b) > confidence(less, a, b));
+                assert!(confidence(a, more, b) > confidence(a, less, b));
+                assert!(confidence(a, b, more) > confidence(a, b, less));
+            }
+        }
+        assert!(confidence(0.0, 0.0, 0.0) < 0.01 && confidence(1.0, 1.0, 1.0) > 0.99);
+    }
+}

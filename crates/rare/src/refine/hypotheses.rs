@@ -150,3 +150,136 @@ fn schedule(voxel: f64, reaches: &[f64], tolerance: f64) -> Icp {
         translation_tolerance: tolerance * voxel,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Point3, Rotation3, Vector3};
+
+    use super::*;
+    use crate::data::{Camera, CorrespondenceSet, Intrinsics, SetName};
+    use crate::random::Random;
+    use crate::scale::SceneKind;
+    use crate::viewpoints::{Frame, Viewpoint};
+
+    const VOXEL: f64 = 0.05;
+
+    fn along_z(by: f64) -> RigidTransform {
+        RigidTransform::from_translation(Vector3::new(0.0, 0.0, by))
+    }
+
+    /// A plane 2 m before a camera.
+    fn plane() -> Vec<Point3<f64>> {
+        let at = |i: i32| f64::from(i) * 0.05;
+        (-8..8).flat_map(|x| (-8..8).map(move |y| Point3::new(at(x), at(y), 2.0))).collect()
+    }
+
+    fn with_verifier<T>(judge: impl FnOnce(&Verifier<'_>) -> T) -> T {
+        let intrinsics =
+            Intrinsics { width: 64, height: 64, fx: 80.0, fy: 80.0, cx: 32.0, cy: 32.0 };
+        let camera = Camera { intrinsics, camera_from_world: RigidTransform::identity() };
+        let viewpoint = Viewpoint { frame: Frame::Reference, camera };
+        let points = plane();
+        judge(&Verifier::new(&points, &points, &[viewpoint], VOXEL))
+    }
+
+    fn poses(ranked: &[Candidate]) -> Vec<f64> {
+        ranked.iter().map(|candidate| candidate.target_from_source.translation().z).collect()
+    }
+
+    #[test]
+    fn the_most_consistent_comes_first() {
+        with_verifier(|verifier| {
+            let current = Candidate::judged(along_z(-0.5), verifier);
+            let ranked = rank(&[along_z(0.6), along_z(0.0)], &current, verifier, VOXEL);
+            // Behind the plane nothing is violated, before it everything.
+            assert_eq!(poses(&ranked), [0.0, 0.6, -0.5]);
+            assert_eq!(ranked[0], Candidate::judged(along_z(0.0), verifier));
+        });
+    }
+
+    #[test]
+    fn of_equals_the_current_one_wins_then_the_earlier() {
+        with_verifier(|verifier| {
+            let current = Candidate::judged(along_z(0.7), verifier);
+            let ranked = rank(&[along_z(0.9), along_z(0.5)], &current, verifier, VOXEL);
+            let scores: Vec<f64> = ranked.iter().map(|c| c.consistency.score()).collect();
+            assert_eq!(scores, [0.0; 3]);
+            assert_eq!(poses(&ranked), [0.7, 0.9, 0.5]);
+        });
+    }
+
+    #[test]
+    fn of_almost_equal_hypotheses_the_first_is_kept() {
+        with_verifier(|verifier| {
+            let turned = |degrees: f64| {
+                let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), degrees.to_radians());
+                RigidTransform::new(turn, Vector3::new(0.0, 0.0, 0.5))
+            };
+            let proposed = [turned(0.0), along_z(0.524), turned(0.9), along_z(0.526), turned(1.1)];
+            let current = Candidate::judged(along_z(0.0), verifier);
+            let ranked = rank(&proposed, &current, verifier, VOXEL);
+            let kept: Vec<RigidTransform> =
+                ranked[1..].iter().map(|candidate| candidate.target_from_source).collect();
+            assert_eq!(kept, [proposed[0], proposed[3], proposed[4]]);
+        });
+    }
+
+    #[test]
+    fn a_pose_has_settled_when_it_hardly_moves() {
+        with_verifier(|verifier| {
+            let at = |pose| Candidate::judged(pose, verifier);
+            let start = at(along_z(0.0));
+            let turned = |degrees: f64| {
+                let turn = Rotation3::from_axis_angle(&Vector3::y_axis(), degrees.to_radians());
+                at(RigidTransform::new(turn, Vector3::zeros()))
+            };
+            assert!(at(along_z(0.0049)).settled(&start, VOXEL));
+            assert!(!at(along_z(0.0051)).settled(&start, VOXEL));
+            assert!(turned(0.09).settled(&start, VOXEL) && !turned(0.11).settled(&start, VOXEL));
+        });
+    }
+
+    /// 12 right pairs and 88 random ones in one set.
+    fn sets(truth: &RigidTransform) -> CorrespondenceSets {
+        let mut random = Random::new(7, 0);
+        let mut pair = |index: usize| {
+            let mut somewhere = || Point3::from(Vector3::from_fn(|_, _| 3.0 * random.uniform()));
+            let (source, elsewhere) = (somewhere(), somewhere());
+            let target = truth.apply(if index < 12 { &source } else { &elsewhere });
+            Correspondence { source, target, score: 1.0 }
+        };
+        let pairs = (0..100).map(&mut pair).collect();
+        CorrespondenceSets { sets: vec![CorrespondenceSet { name: SetName::Features3d, pairs }] }
+    }
+
+    #[test]
+    fn consensus_finds_what_one_fit_over_all_pairs_misses() {
+        let truth = RigidTransform::new(Rotation3::new(Vector3::new(0.4, 0.2, -0.1)), Vector3::x());
+        let scale = Scale::with_voxel(SceneKind::Indoor, VOXEL);
+        let paper = propose(&Recipe::paper(), &scale, &sets(&truth)).unwrap();
+        assert_eq!(paper.len(), 1);
+        assert!(paper[0].error_to(&truth).translation > 0.05, "{paper:?}");
+        let ours = propose(&Recipe::default(), &scale, &sets(&truth)).unwrap();
+        assert!(ours.len() > 1);
+        assert!(ours[0].error_to(&truth).translation < 1e-6, "{:?}", ours[0]);
+        let nothing = CorrespondenceSets::default();
+        assert!(propose(&Recipe::default(), &scale, &nothing).is_err());
+    }
+
+    #[test]
+    fn the_best_scored_pairs_are_kept_in_order() {
+        let at = Point3::origin();
+        let mut pairs: Vec<Correspondence> = [0.1, 0.9, 0.5, 0.9]
+            .iter()
+            .zip(0..)
+            .map(|(&score, x)| Correspondence {
+                source: Point3::new(f64::from(x), 0.0, 0.0),
+                target: at,
+                score,
+            })
+            .collect();
+        keep_best_scored(&mut pairs, 3);
+        let kept: Vec<f64> = pairs.iter().map(|pair| pair.source.x).collect();
+        assert_eq!(kept, [1.0, 3.0, 2.0]);
+    }
+}

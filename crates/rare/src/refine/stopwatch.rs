@@ -44,3 +44,32 @@ impl<'a> Stopwatch<'a> {
         self.timings
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+    use std::thread::sleep;
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn times_of_a_step_add_up_in_the_order_of_first_runs() {
+        let announced = Mutex::new(Vec::new());
+        let announce = |step| announced.lock().unwrap().push(step);
+        let mut clock = Stopwatch::new(Some(&announce));
+        let pause = |milliseconds| sleep(Duration::from_millis(milliseconds));
+        let answer = clock.time("match", || {
+            pause(4);
+            42
+        });
+        clock.time("fuse", || ());
+        clock.time("match", || pause(4));
+        assert_eq!(answer, 42);
+        let timings = clock.into_timings();
+        let steps: Vec<&str> = timings.iter().map(|timing| timing.step.as_str()).collect();
+        assert_eq!(steps, ["match", "fuse"]);
+        assert!(timings[0].seconds >= 0.008, "{timings:?}");
+        assert_eq!(*announced.lock().unwrap(), ["match", "fuse", "match"]);
+    }
+}

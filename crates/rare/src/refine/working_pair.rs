@@ -264,3 +264,140 @@ fn check_features(source: &Scan, target: &Scan) -> Result<()> {
         _ => Ok(()),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Rotation3;
+
+    use super::*;
+    use crate::refine::Recipe;
+
+    /// A corner of a room of `size`, a point every 1/20 of it.
+    fn corner(size: f64, shift: Vector3<f64>) -> Scan {
+        let step = |i: u32| f64::from(i) / 20.0 * size;
+        let pairs = (0..20).flat_map(|a| (0..20).map(move |b| (step(a), step(b))));
+        let points = pairs.flat_map(|(a, b)| {
+            [Point3::new(a, b, 0.0), Point3::new(a, 0.0, b), Point3::new(0.0, a, b)]
+        });
+        PointCloud::new(points.map(|point| point + shift).collect()).unwrap().into()
+    }
+
+    fn scan(points: Vec<Point3<f64>>) -> Scan {
+        PointCloud::new(points).unwrap().into()
+    }
+
+    fn message(source: &Scan, target: &Scan) -> String {
+        match WorkingPair::new(source, target, &RefinerConfig::default()) {
+            Ok(_) => String::new(),
+            Err(error) => error.to_string(),
+        }
+    }
+
+    #[test]
+    fn clouds_that_do_not_determine_a_pose_are_refused() {
+        let good = corner(1.0, Vector3::zeros());
+        let line =
+            |i: i32| Point3::new(1.0, 2.0, 3.0) + Vector3::new(0.3, -0.2, 1.0) * f64::from(i);
+        for (bad, word) in [
+            (scan((0..2).map(line).collect()), "2 points"),
+            (scan(vec![Point3::new(1.0, 2.0, 3.0); 50]), "identical"),
+            (scan((0..50).map(line).collect()), "one line"),
+        ] {
+            let (first, second) = (message(&bad, &good), message(&good, &bad));
+            assert!(first.contains(word) && first.contains("source"), "{first}");
+            assert!(second.contains(word) && second.contains("reference"), "{second}");
+        }
+        assert_eq!(message(&good, &good), "");
+    }
+
+    #[test]
+    fn features_of_one_side_only_or_of_two_kinds_are_refused() {
+        let with_features = |dimension| {
+            let points = vec![Point3::origin(); 4];
+            let values = vec![1.0; 4 * dimension];
+            let features = PointFeatures::new(points, dimension, values).unwrap();
+            Scan { features: Some(features), ..corner(1.0, Vector3::zeros()) }
+        };
+        let without = corner(1.0, Vector3::zeros());
+        assert!(message(&with_features(2), &without).contains("only one"));
+        assert!(message(&without, &with_features(2)).contains("only one"));
+        let different = message(&with_features(2), &with_features(3));
+        assert!(different.contains("2 dimensions") && different.contains('3'), "{different}");
+        assert_eq!(message(&with_features(2), &with_features(2)), "");
+    }
+
+    #[test]
+    fn a_working_voxel_is_5_centimetres_and_all_lengths_follow() {
+        let clouds = (corner(40.0, Vector3::zeros()), corner(40.0, Vector3::zeros()));
+        let pair = WorkingPair::new(&clouds.0, &clouds.1, &RefinerConfig::default()).unwrap();
+        assert!((pair.scale.voxel - 0.05).abs() < 1e-12, "{}", pair.scale.voxel);
+        assert!(pair.unit > 10.0);
+        let back = pair.source.points[7] * pair.unit - clouds.0.cloud.points()[7].coords;
+        assert!(back.coords.norm() < 1e-9);
+        // The paper's recipe stays in metres.
+        let config = RefinerConfig { recipe: Recipe::paper(), ..RefinerConfig::default() };
+        let metric = WorkingPair::new(&clouds.0, &clouds.1, &config).unwrap();
+        assert_eq!(metric.unit, 1.0);
+        assert_eq!(&*metric.source.points, clouds.0.cloud.points());
+    }
+
+    fn pose() -> RigidTransform {
+        RigidTransform::new(
+            Rotation3::new(Vector3::new(0.2, -0.5, 1.1)),
+            Vector3::new(3.0, 4.0, 5.0),
+        )
+    }
+
+    #[test]
+    fn poses_go_into_the_working_frames_and_back() {
+        let far = Vector3::new(500_123.0, 5_400_321.0, 120.0);
+        for (source_shift, target_shift) in [
+            (Vector3::zeros(), Vector3::zeros()),
+            (far, far + Vector3::new(200.0, -70.0, 3.0)),
+            (Vector3::zeros(), far),
+        ] {
+            let (source, target) = (corner(7.0, source_shift), corner(7.0, target_shift));
+            let pair = WorkingPair::new(&source, &target, &RefinerConfig::default()).unwrap();
+            let working = pair.to_working(&pose());
+            let error = pair.to_world(&working).error_to(&pose());
+            assert!(error.rotation_degrees < 1e-9 && error.translation < 1e-6, "{error:?}");
+            // The working pose moves working points as the pose moves points.
+            let world = source.cloud.world_points()[11];
+            let expected = (pose().apply(&world) - target.cloud.shift()) / pair.unit;
+            let moved = working.apply(&pair.source.points[11]);
+            // Coordinates of 5 000 km have steps of a nanometre.
+            assert!((moved - expected).norm() < 1e-7, "{moved} {expected}");
+            let given = Correspondence { source: world, target: pose().apply(&world), score: 0.5 };
+            let pairs = pair.to_working_pairs(&[given]);
+            assert!((pairs[0].source - pair.source.points[11]).norm() < 1e-7);
+            assert!((pairs[0].target - expected).norm() < 1e-7);
+            assert_eq!(pairs[0].score, 0.5);
+        }
+    }
+
+    #[test]
+    fn given_features_are_thinned_and_moved_with_their_cloud() {
+        let far = Vector3::new(500_000.0, 0.0, 0.0);
+        let mut source = corner(1.0, far);
+        let points = source.cloud.world_points();
+        let values = (0..points.len()).flat_map(|i| [i as f32 + 1.0, 0.0]).collect();
+        source.features = Some(PointFeatures::new(points, 2, values).unwrap());
+        let pair = WorkingPair::new(&source, &source, &RefinerConfig::default()).unwrap();
+        let keypoints = &pair.source.keypoints;
+        assert_eq!((keypoints.len(), keypoints.dimension()), (500, 2));
+        assert!(keypoints.points().iter().all(|point| pair.source.points.contains(point)));
+        assert!(keypoints.values().iter().all(|&value| value == 0.0 || (value - 1.0).abs() < 1e-4));
+    }
+
+    #[test]
+    fn dropped_points_are_reported() {
+        let mut points = corner(1.0, Vector3::zeros()).cloud.points().to_vec();
+        points.push(Point3::new(f64::NAN, 0.0, 0.0));
+        let (broken, whole) = (scan(points), corner(1.0, Vector3::zeros()));
+        let config = RefinerConfig::default();
+        let warnings = WorkingPair::new(&broken, &whole, &config).unwrap().warnings();
+        assert_eq!(warnings.len(), 1);
+        assert!(warnings[0].contains("1 points") && warnings[0].contains("source"), "{warnings:?}");
+        assert!(WorkingPair::new(&whole, &whole, &config).unwrap().warnings().is_empty());
+    }
+}

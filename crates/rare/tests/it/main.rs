@@ -20,6 +20,7 @@ mod project;
 mod ransac;
 mod real_pairs;
 mod reduce;
+mod refine;
 mod sc2_pcr;
 mod shared;
 mod synthetic_pairs;
