@@ -82,6 +82,10 @@ fn main() {
                 let features = design.encode(&maps).unwrap();
                 let lifted: Vec<PointFeatures> =
                     (0..2).map(|i| lift(&maps[i], &features[i][0])).collect();
+                // Too little in common in this view to say anything; the same rule for all designs.
+                if lifted.iter().any(|keypoints| keypoints.len() < 50) {
+                    continue;
+                }
                 let matches = rare::matching::mutual_nearest(&lifted[1], &lifted[0], None).unwrap();
                 seconds += start.elapsed().as_secs_f64();
                 let truth_from_view = truth * initial.inverse();

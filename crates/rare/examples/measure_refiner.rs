@@ -9,7 +9,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use nalgebra::Matrix4;
-use rare::{Recipe, Refiner, RefinerConfig, RigidTransform, Scan};
+use rare::{Correspondence, Recipe, Refiner, RefinerConfig, RigidTransform, Scan};
 use serde_json::Value;
 
 fn transform(value: &Value) -> RigidTransform {
@@ -45,6 +45,7 @@ fn main() {
     let config: RefinerConfig = serde_json::from_value(config).unwrap();
     let lidar = folder.to_string_lossy().contains("lidar");
     let (limit_degrees, limit_metres) = if lidar { (5.0, 0.6) } else { (15.0, 0.3) };
+    let inlier_distance = if lidar { 0.6 } else { 0.1 };
     let mut clouds = BTreeMap::new();
     let (mut count, mut solved_before, mut solved_after, mut lost) = (0, 0, 0, 0);
     let (mut rotation, mut translation, mut seconds) = (0.0, 0.0, 0.0);
@@ -96,10 +97,13 @@ fn main() {
         for timing in &result.timings {
             *timings.entry(timing.step.clone()).or_default() += timing.seconds;
         }
-        for set in &result.sets {
+        for set in &result.matches.sets {
+            let right = |pair: &&Correspondence| {
+                (truth.apply(&pair.source) - pair.target).norm() < inlier_distance
+            };
             let entry = sets.entry(set.name.to_string()).or_default();
-            entry.0 += set.correspondences;
-            entry.1 += set.inliers;
+            entry.0 += set.pairs.len();
+            entry.1 += set.pairs.iter().filter(right).count();
         }
         if verbose {
             println!(
@@ -138,7 +142,7 @@ fn main() {
             println!("  {name} {:.0} ms", 1e3 * time / n);
         }
         for (name, (all, good)) in sets {
-            println!("  {name} {:.0} pairs, {:.2} agree", all as f64 / n, good as f64 / all as f64);
+            println!("  {name} {:.0} pairs, {:.3} right", all as f64 / n, good as f64 / all as f64);
         }
     }
 }

@@ -1,4 +1,23 @@
-//! Registration refinement for point clouds after RARE (ICCV 2025).
+#![doc = include_str!("../README.md")]
+//!
+//! # The pipeline
+//!
+//! | step | module | what it does |
+//! |---|---|---|
+//! | before | [`scale`], [`viewpoints`] | every length from one voxel size; virtual cameras |
+//! | 1 | [`project`] | a cloud seen by a camera becomes a depth map |
+//! | 2 | [`densify`] | gaps between the points are closed |
+//! | 3 | [`encode`], [`depth_features`], [`hint`] | depth maps become dense features |
+//! | 4 | [`reduce`] | joint principal components per layer and view |
+//! | 5 | [`transfer`] | pixels become points; common points |
+//! | 6 | [`fuse`] | 2D and 3D features side by side |
+//! | 7 | [`matching`] | features become correspondences |
+//! | 8 | [`aggregate`] | five sets become one transform |
+//! | 9 | [`verify`] | is it believable |
+//! | all | [`refine`] | the order of the steps: [`Refiner`] |
+//!
+//! Around it: [`data`] (the nouns), [`pose`] (estimators), [`features`] (normals, histograms), [`io`] (files),
+//! [`synthetic`] (simulated scans), [`random`], [`error`].
 #![forbid(unsafe_code)]
 
 pub mod aggregate;

@@ -67,6 +67,8 @@ pub struct Refinement {
     pub correspondences: usize,
     /// The same by set.
     pub sets: Vec<SetEvidence>,
+    /// The correspondences themselves, each side in its cloud's frame as the caller gave it, metres.
+    pub matches: CorrespondenceSets,
     /// Two-way depth consistency of the clouds under the transform.
     pub consistency: DepthConsistency,
     /// The 6 x 6 information matrix of 3DMatch's `gt.info` (translation first, metres) over the overlapping source
@@ -310,6 +312,7 @@ impl Refiner {
             correspondences: set.pairs.len(),
             inliers: vote(&set.pairs, &[*pose], radius)[0],
         };
+        let matches = pair.to_world_sets(sets);
         let sets: Vec<SetEvidence> = sets.sets.iter().map(of_set).collect();
         let overlap = pair.overlap(pose);
         let inliers: usize = sets.iter().map(|set| set.inliers).sum();
@@ -324,6 +327,7 @@ impl Refiner {
             inliers,
             correspondences,
             sets,
+            matches,
             consistency: best.consistency,
             information: overlap.information,
             scale: pair.scale.in_units(1.0 / pair.unit),

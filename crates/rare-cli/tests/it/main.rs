@@ -5,5 +5,6 @@ mod bad_input;
 mod commands;
 mod options;
 mod outputs;
+mod readme;
 mod registration;
 mod shared;

@@ -1,5 +1,7 @@
 //! The bilateral filter of step 2, by its formula.
 
+use std::ops::Range;
+
 use std::f32::consts::LOG2_E;
 
 use super::image::Image;
@@ -32,22 +34,40 @@ pub fn bilateral5(image: &mut Image, sigma_value: f32, sigma_space: f32) {
     let by_distance = -LOG2_E / (2.0 * sigma_space * sigma_space);
     let mut padded = vec![0.0; image.width() + 4];
     let mut weights = vec![0.0; image.width()];
+    let extents: Vec<Range<usize>> = (0..image.height()).map(|y| extent(image.row(y))).collect();
     image.rewrite_rows(|image, y, sums| {
         let centres = image.row(y);
         sums.copy_from_slice(centres);
+        // Where all taps are 0 so is their mean; half-empty images are the rule.
+        let rows = (0..5).map(|row| &extents[reflect(y + row, image.height())]);
+        let columns =
+            rows.fold(image.width()..0, |all, row| all.start.min(row.start)..all.end.max(row.end));
+        let columns = columns.start.saturating_sub(2)..(columns.end + 2).min(image.width());
+        if columns.is_empty() {
+            return;
+        }
+        let (centres, sums) = (&centres[columns.clone()], &mut sums[columns.clone()]);
+        let weights = &mut weights[columns.clone()];
         weights.fill(1.0);
         for (row, taps) in TAPS.iter().enumerate() {
             pad(image.row(reflect(y + row, image.height())), &mut padded);
             for &(column, squared_distance) in *taps {
                 let offset = by_distance * squared_distance;
                 let weight = |difference| exp2(by_value * difference * difference + offset);
-                add_tap(&padded[column..], centres, sums, &mut weights, weight);
+                add_tap(&padded[columns.start + column..], centres, sums, weights, weight);
             }
         }
-        for (sum, &weight) in sums.iter_mut().zip(&weights) {
+        for (sum, &mut weight) in sums.iter_mut().zip(weights) {
             *sum /= weight;
         }
     });
+}
+
+/// The columns from the first to the last value that is not 0; `width..0` if there is none.
+fn extent(row: &[f32]) -> Range<usize> {
+    let first = row.iter().position(|&value| value != 0.0);
+    let last = row.iter().rposition(|&value| value != 0.0);
+    first.unwrap_or(row.len())..last.map_or(0, |last| last + 1)
 }
 
 /// Copies a row with two more pixels on each side.

@@ -4,7 +4,7 @@ use std::io::{self, Cursor, Read, Write};
 use std::path::{Path, PathBuf};
 
 use nalgebra::Point3;
-use npyz::npz::NpzArchive;
+use zip::ZipArchive;
 
 use super::contain_panics::contain_panics;
 use super::npy::{Array, Header};
@@ -20,7 +20,7 @@ const LARGEST_RATIO: u64 = 1032;
 /// An `.npz` archive of named arrays, read into memory.
 pub struct NpzFile {
     path: PathBuf,
-    archive: NpzArchive<Cursor<Vec<u8>>>,
+    archive: ZipArchive<Cursor<Vec<u8>>>,
     /// Length of the file, bytes.
     length: u64,
 }
@@ -50,7 +50,7 @@ impl NpzFile {
         let length = bytes.len() as u64;
         check_directory(&bytes)?;
         let archive = contain_panics(|| {
-            NpzArchive::new(Cursor::new(bytes)).map_err(|error| {
+            ZipArchive::new(Cursor::new(bytes)).map_err(|error| {
                 Error::invalid(format!("the archive is damaged ({error}): save it again"))
             })
         })?;
@@ -60,7 +60,9 @@ impl NpzFile {
     /// The names of the arrays, sorted.
     #[must_use]
     pub fn names(&self) -> Vec<String> {
-        let mut names: Vec<String> = self.archive.array_names().map(str::to_owned).collect();
+        let entries = self.archive.file_names().flatten();
+        let array = |name: std::borrow::Cow<'_, str>| Some(name.strip_suffix(".npy")?.to_owned());
+        let mut names: Vec<String> = entries.filter_map(array).collect();
         names.sort();
         names
     }
@@ -107,10 +109,8 @@ impl NpzFile {
         }
         let (archive, length) = (&mut self.archive, self.length);
         contain_panics(|| {
-            let mut entry = archive
-                .zip_archive()
-                .by_name(&format!("{name}.npy"))
-                .map_err(|error| damaged(&error))?;
+            let mut entry =
+                archive.by_name(&format!("{name}.npy")).map_err(|error| damaged(&error))?;
             check_packing(&entry.compression().to_string())?;
             let size = entry.size();
             check_size(size, entry.compressed_size(), length)?;

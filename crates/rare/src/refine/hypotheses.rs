@@ -1,5 +1,6 @@
 //! Candidate transforms: where they come from, and which one wins.
 
+use nalgebra::Point3;
 use rayon::prelude::*;
 
 use crate::aggregate::{Aggregation, aggregate, aggregate_candidates};
@@ -122,15 +123,15 @@ pub(super) fn polish(
     all[0]
 }
 
-/// The winner moved onto the surface with all half-voxel points; kept unless it verifies worse.
+/// The winner moved onto the surface with half-voxel points, every second of them; kept unless it verifies worse.
 pub(super) fn finish(
     pair: &WorkingPair<'_>,
     best: &Candidate,
     verifier: &Verifier<'_>,
 ) -> Candidate {
     let icp = schedule(pair.scale.voxel, &[1.0], 0.01);
-    let Ok(aligned) = icp.align(&pair.source.fine, &pair.target_surface, &best.target_from_source)
-    else {
+    let source: Vec<Point3<f64>> = pair.source.fine.iter().step_by(2).copied().collect();
+    let Ok(aligned) = icp.align(&source, &pair.target_surface, &best.target_from_source) else {
         return *best;
     };
     let finished = Candidate::judged(aligned.target_from_source, verifier);

@@ -8,7 +8,8 @@ use std::borrow::Cow;
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use crate::data::{
-    Correspondence, KdTree, PointCloud, PointFeatures, RigidTransform, Scan, voxel_downsample,
+    Correspondence, CorrespondenceSet, CorrespondenceSets, KdTree, PointCloud, PointFeatures,
+    RigidTransform, Scan, voxel_downsample,
 };
 use crate::error::{Error, Result};
 use crate::features::{estimate_normals, fpfh_at, orient_towards};
@@ -107,6 +108,20 @@ impl<'a> WorkingPair<'a> {
         pairs.iter().map(to_working).collect()
     }
 
+    /// Correspondences of the working frames in the callers' frames.
+    pub(crate) fn to_world_sets(&self, sets: &CorrespondenceSets) -> CorrespondenceSets {
+        let to_world = |pair: &Correspondence| Correspondence {
+            source: pair.source * self.unit + self.source_cloud.shift(),
+            target: pair.target * self.unit + self.target_cloud.shift(),
+            score: pair.score,
+        };
+        let set_to_world = |set: &CorrespondenceSet| CorrespondenceSet {
+            name: set.name,
+            pairs: set.pairs.iter().map(to_world).collect(),
+        };
+        CorrespondenceSets { sets: sets.sets.iter().map(set_to_world).collect() }
+    }
+
     /// How much of the source lies on the target under a pose, in metres.
     pub(crate) fn overlap(&self, target_from_source: &RigidTransform) -> Overlap {
         let tree = self.target_surface.tree();
@@ -137,8 +152,8 @@ impl<'a> WorkingCloud<'a> {
         stream: u64,
     ) -> Result<WorkingCloud<'a>> {
         let points = in_units(scan.cloud.points(), unit);
-        let coarse = voxel_downsample(&points, scale.voxel)?;
         let fine = voxel_downsample(&points, scale.voxel / 2.0)?;
+        let coarse = voxel_downsample(&fine, scale.voxel)?;
         let count = config.recipe.keypoints.unwrap_or(scale.keypoints);
         let mut random = Random::new(config.seed, stream);
         let keypoints = match &scan.features {
