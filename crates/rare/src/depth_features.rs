@@ -310,10 +310,10 @@ mod tests {
 
     #[test]
     fn a_place_looks_the_same_from_nearer_by() {
-        let (far, near) = (descriptors(&hills(0.0)), descriptors(&hills(0.5)));
+        let (far, near) = (descriptors(&hills(0.0)), descriptors(&hills(0.9)));
         let same = similarity(&far[MIDDLE], &near[MIDDLE]);
         let other = similarity(&far[MIDDLE], &near[MIDDLE + 4]);
-        assert!(same > 0.97 && other < same - 0.05, "{same} {other}");
+        assert!(same > 0.95 && other < same - 0.05, "{same} {other}");
         let nearest = |cells: &[Vec<f32>]| {
             let to = |cell: &usize| similarity(&far[MIDDLE], &cells[*cell]);
             (0..cells.len()).max_by(|a, b| to(a).total_cmp(&to(b)))
@@ -333,7 +333,6 @@ mod tests {
         assert!(same > 0.7, "{same}");
         // Two places with the same hole at their side are no more alike than before.
         let alike = |cells: &[Vec<f32>]| similarity(&cells[MIDDLE], &cells[MIDDLE - 21 * 5]);
-        println!("{same} {} {}", alike(&whole), alike(&holed));
         assert!(alike(&holed) < alike(&whole) + 0.05, "{} {}", alike(&whole), alike(&holed));
     }
 

@@ -1,8 +1,9 @@
 //! From two clouds and a start to a verified pose, over all steps.
 
+use std::f64::consts::FRAC_PI_2;
 use std::sync::OnceLock;
 
-use nalgebra::{Matrix4, Point3, Vector3};
+use nalgebra::{Matrix4, Point3, Rotation3, Vector3};
 use rare::data::{KdTree, LayeredFeatures, voxel_downsample};
 use rare::encode::DepthEncoder;
 use rare::features::{estimate_normals, fpfh_at, orient_towards};
@@ -216,7 +217,13 @@ fn clouds_that_do_not_overlap_are_rejected() {
 
 #[test]
 fn a_room_is_registered_from_nothing() {
-    let pair = Pair::thinned(&room_pair(2, 0.65..=0.8).unwrap(), 3);
+    let mut pair = Pair::thinned(&room_pair(2, 0.65..=0.8).unwrap(), 3);
+    // The source's camera was held upright.
+    let roll = Rotation3::from_axis_angle(&Vector3::z_axis(), FRAC_PI_2);
+    let rolled = RigidTransform::new(roll, Vector3::zeros());
+    let points = rolled.apply_all(pair.source.cloud.points());
+    pair.source = PointCloud::new(points).unwrap().into();
+    pair.truth = pair.truth * rolled.inverse();
     for method in [InitialMethod::Sc2Pcr, InitialMethod::Ransac] {
         let refinement =
             Refiner::new(default()).register(&pair.source, &pair.target, method).unwrap();
