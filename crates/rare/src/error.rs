@@ -15,12 +15,12 @@ pub enum Error {
     #[error("{0}")]
     InvalidInput(String),
     /// The operating system refused: the caller mends the path or its permissions.
-    #[error("{}: {source}", path.display())]
+    #[error("{}: {cause}", path.display())]
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the operating system said.
-        source: io::Error,
+        /// What the operating system said. It is part of the message, so it is not a source to be printed once more.
+        cause: io::Error,
     },
     /// The input is well-formed, but uses something that this version does not read.
     #[error("{0}")]
@@ -48,8 +48,8 @@ impl Error {
     }
 
     /// An operating-system error about `path`.
-    pub fn io(path: impl Into<PathBuf>, source: io::Error) -> Error {
-        Error::Io { path: path.into(), source }
+    pub fn io(path: impl Into<PathBuf>, cause: io::Error) -> Error {
+        Error::Io { path: path.into(), cause }
     }
 
     /// The data do not determine a pose because of `why`.

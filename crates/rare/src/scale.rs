@@ -64,6 +64,8 @@ const VOXEL_BY_RADIUS: f64 = 0.05;
 const VOXEL_BY_RANGE: f64 = 0.02;
 /// Voxels grow while they are more than this share of the points, so that they average some.
 const SPARSE: f64 = 0.9;
+/// A given voxel size may divide the extent of a cloud into this many.
+const FINEST: f64 = 1e6;
 /// The depth that 3DMatch uses, in voxels: 15 m of 5 cm, minus the sentinel that the densifier needs.
 const DEPTH_IN_VOXELS: f64 = 300.0;
 
@@ -82,6 +84,9 @@ impl Scale {
             return Err(Error::invalid(format!(
                 "the voxel size is {voxel}, it must be a positive length in metres"
             )));
+        }
+        if let Some(voxel) = voxel {
+            check_fineness(voxel, source, target)?;
         }
         let kind = match profile {
             Profile::Indoor => SceneKind::Indoor,
@@ -148,6 +153,21 @@ impl SceneKind {
     fn common(self, other: SceneKind) -> SceneKind {
         if self == other { self } else { SceneKind::Object }
     }
+}
+
+/// A voxel that is lost in the extent of the clouds is a slip of the keyboard.
+fn check_fineness(voxel: f64, source: &PointCloud, target: &PointCloud) -> Result<()> {
+    for cloud in [source, target] {
+        let (low, high) = cloud.bounds();
+        let extent = (high - low).amax();
+        if extent > FINEST * voxel {
+            return Err(Error::invalid(format!(
+                "the voxel size of {voxel} m is too small for a cloud of {extent} m: give at least {:.1e} m",
+                extent / FINEST
+            )));
+        }
+    }
+    Ok(())
 }
 
 /// Share of the points inside the frustum of a depth camera at the origin (57 x 45 degrees, z forward).
@@ -376,5 +396,13 @@ mod tests {
         for value in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             assert_eq!(two_digits(value), 0.0);
         }
+    }
+
+    #[test]
+    fn a_voxel_lost_in_the_cloud_is_refused() {
+        let cloud = cloud(|random| Point3::new(random.uniform() * 30.0, random.uniform(), 2.0));
+        let scale = |voxel| Scale::new(Profile::Auto, Some(voxel), &cloud, &cloud);
+        assert!(scale(1e-6).unwrap_err().to_string().contains("too small"));
+        assert_eq!(scale(1e-3).unwrap().voxel, 1e-3);
     }
 }
