@@ -190,7 +190,7 @@ impl Refiner {
         let mut sets = CorrespondenceSets::default();
         for _ in 0..self.config.recipe.rounds {
             sets = self.correspondence_sets(pair, &best.target_from_source, given, &mut clock)?;
-            let next = self.next_candidate(pair, &sets, &best, &verifier, &mut clock)?;
+            let next = self.next_candidate(pair, &sets, &best, &verifier, &mut clock);
             let settled = next.settled(&best, pair.scale.voxel);
             best = next;
             if settled {
@@ -237,22 +237,22 @@ impl Refiner {
         current: &Candidate,
         verifier: &Verifier<'_>,
         clock: &mut Stopwatch<'_>,
-    ) -> Result<Candidate> {
+    ) -> Candidate {
         let recipe = &self.config.recipe;
-        let proposed = clock.time("aggregate", || hypotheses::propose(recipe, &pair.scale, sets));
+        // Sets that determine nothing propose nothing: then the current pose stands.
+        let proposed = clock
+            .time("aggregate", || hypotheses::propose(recipe, &pair.scale, sets))
+            .unwrap_or_default();
         if !recipe.keep_initial {
-            return Ok(Candidate::judged(
-                proposed?.first().copied().unwrap_or(current.target_from_source),
-                verifier,
-            ));
+            let first = proposed.first().unwrap_or(&current.target_from_source);
+            return Candidate::judged(*first, verifier);
         }
-        let ranked = clock.time("verify", || {
-            hypotheses::rank(&proposed.unwrap_or_default(), current, verifier, pair.scale.voxel)
-        });
+        let ranked = clock
+            .time("verify", || hypotheses::rank(&proposed, current, verifier, pair.scale.voxel));
         if !recipe.polish {
-            return Ok(ranked.into_iter().next().unwrap_or(*current));
+            return ranked.into_iter().next().unwrap_or(*current);
         }
-        Ok(clock.time("polish", || hypotheses::polish(pair, &ranked, verifier)))
+        clock.time("polish", || hypotheses::polish(pair, &ranked, verifier))
     }
 
     /// The paper sees a street through KITTI's colour camera; everything else chooses by the kind of scene.
