@@ -34,8 +34,8 @@ pub(crate) struct Options {
     /// What kind of scans these are; auto looks at the clouds [default: auto]
     #[arg(long, value_name = "PROFILE", value_parser = choice::<Profile>(&["auto", "indoor", "lidar", "object"]))]
     pub(crate) profile: Option<Profile>,
-    /// From where the clouds are looked at; auto follows the kind of scene [default: auto; with --preset paper
-    /// --profile lidar: kitti]
+    /// From where the clouds are looked at; auto follows the kind of scene [default: auto; --preset paper sees
+    /// lidar scans through kitti]
     #[arg(long, value_name = "CAMERA", value_parser = choice::<CameraChoice>(&["auto", "sensor", "kitti", "ring", "overlap"]))]
     pub(crate) camera: Option<CameraChoice>,
     /// Voxel size in metres; all other lengths are multiples of it [default: indoor 0.05, lidar 0.3, otherwise from
@@ -195,12 +195,9 @@ impl Options {
             recipe.rounds = 1;
         }
         let profile = self.profile.unwrap_or_default();
-        // The paper's KITTI experiment looks through the one colour camera.
-        let kitti = paper && profile == Profile::Lidar;
-        let camera = if kitti { CameraChoice::Kitti } else { CameraChoice::Auto };
         RefinerConfig {
             profile,
-            camera: self.camera.unwrap_or(camera),
+            camera: self.camera.unwrap_or_default(),
             voxel: self.voxel,
             seed: self.seed.unwrap_or(0),
             recipe,

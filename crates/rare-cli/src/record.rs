@@ -112,7 +112,7 @@ fn config(registration: &Registration) -> Config<'_> {
         inputs: &registration.inputs,
         preset: settings.preset,
         profile: settings.refiner.profile,
-        camera: chosen_camera(settings.refiner.camera, scale.kind),
+        camera: chosen_camera(settings.refiner.camera, scale.kind, &settings.refiner.recipe),
         voxel: scale.voxel,
         seed: settings.refiner.seed,
         encoder: settings.encoder(),
@@ -124,9 +124,11 @@ fn config(registration: &Registration) -> Config<'_> {
 }
 
 /// The cameras that `auto` stands for.
-fn chosen_camera(choice: CameraChoice, kind: SceneKind) -> CameraChoice {
+fn chosen_camera(choice: CameraChoice, kind: SceneKind, recipe: &Recipe) -> CameraChoice {
     match (choice, kind) {
         (CameraChoice::Auto, SceneKind::Indoor) => CameraChoice::Sensor,
+        // In metres, as the paper has it, a street is seen through KITTI's one colour camera.
+        (CameraChoice::Auto, SceneKind::Lidar) if recipe.metric => CameraChoice::Kitti,
         (CameraChoice::Auto, SceneKind::Lidar) => CameraChoice::Ring,
         (CameraChoice::Auto, SceneKind::Object) => CameraChoice::Overlap,
         (choice, _) => choice,
