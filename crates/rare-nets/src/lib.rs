@@ -1,0 +1,17 @@
+//! Every network of `rare`, on its own CPU engine.
+//!
+//! | module | what it holds |
+//! |---|---|
+//! | [`engine`] | tensors, operations of fused size, kernels for each processor |
+//! | [`checkpoint`] | weight files, read without executing anything |
+//! | [`diffusion`] | Stable Diffusion 1.5 with a depth `ControlNet`: features of depth maps |
+//!
+//! The networks are written once, generic over [`engine::Backend`]; the geometry that uses their features is in the
+//! crate `rare`.
+
+pub mod checkpoint;
+pub mod diffusion;
+pub mod engine;
+mod parameter;
+
+pub use parameter::{Parameter, Values};

@@ -1,0 +1,1 @@
+//! Integration tests: golden data and real files.
