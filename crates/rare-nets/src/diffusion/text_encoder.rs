@@ -58,7 +58,8 @@ impl<B: Backend> TextEncoder<B> {
             token_embedding: loader.values("text_model.embeddings.token_embedding.weight")?,
             position_embedding: loader.values("text_model.embeddings.position_embedding.weight")?,
             layers: layers.collect::<Result<Vec<Layer<B>>>>()?,
-            final_norm: loader.layer_normalization("text_model.final_layer_norm", config.epsilon)?,
+            final_norm: loader
+                .layer_normalization("text_model.final_layer_norm", config.epsilon)?,
         })
     }
 
@@ -99,10 +100,7 @@ impl<B: Backend> TextEncoder<B> {
     fn token(&self, token: u32) -> Result<&[f32]> {
         let mut rows = self.token_embedding.chunks_exact(self.config.hidden_size);
         rows.nth(token as usize).ok_or_else(|| {
-            Error::Internal(format!(
-                "token {token} in a vocabulary of {}",
-                self.config.vocabulary
-            ))
+            Error::Internal(format!("token {token} in a vocabulary of {}", self.config.vocabulary))
         })
     }
 }

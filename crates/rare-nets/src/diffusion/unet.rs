@@ -207,7 +207,11 @@ impl<B: Backend> Head<B> {
 }
 
 /// Puts the text of one prompt, tokens x width, on the backend.
-pub(crate) fn upload_text<B: Backend>(backend: &B, text: &[f32], width: usize) -> Result<B::Tensor> {
+pub(crate) fn upload_text<B: Backend>(
+    backend: &B,
+    text: &[f32],
+    width: usize,
+) -> Result<B::Tensor> {
     let shape = Shape { batch: 1, height: 1, width: text.len() / width.max(1), channels: width };
     backend.upload(shape, text)
 }

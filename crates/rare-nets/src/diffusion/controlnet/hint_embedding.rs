@@ -17,16 +17,11 @@ pub(super) struct HintEmbedding<B: Backend> {
 
 impl<B: Backend> HintEmbedding<B> {
     pub(super) fn load(loader: &Loader<'_, B>) -> Result<HintEmbedding<B>> {
-        let kernel =
-            |part: &str| loader.kernel(&format!("controlnet_cond_embedding.{part}"));
+        let kernel = |part: &str| loader.kernel(&format!("controlnet_cond_embedding.{part}"));
         let blocks = (0..BLOCKS)
             .map(|index| kernel(&format!("blocks.{index}")))
             .collect::<Result<Vec<B::Weight>>>()?;
-        Ok(HintEmbedding {
-            conv_in: kernel("conv_in")?,
-            blocks,
-            conv_out: kernel("conv_out")?,
-        })
+        Ok(HintEmbedding { conv_in: kernel("conv_in")?, blocks, conv_out: kernel("conv_out")? })
     }
 
     pub(super) fn run(&self, backend: &B, hint: &B::Tensor) -> Result<B::Tensor> {

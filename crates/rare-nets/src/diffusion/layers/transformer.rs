@@ -51,8 +51,7 @@ impl<B: Backend> Transformer<B> {
             self_out: kernel("attn1.to_out.0")?,
             norm2: norm("norm2")?,
             cross_queries: kernel("attn2.to_q")?,
-            cross_keys_values: loader
-                .joint_kernel(&format!("{block}.attn2"), &["to_k", "to_v"])?,
+            cross_keys_values: loader.joint_kernel(&format!("{block}.attn2"), &["to_k", "to_v"])?,
             cross_out: kernel("attn2.to_out.0")?,
             norm3: norm("norm3")?,
             feed_forward_in: loader.gated_kernel(&format!("{block}.ff.net.0.proj"))?,

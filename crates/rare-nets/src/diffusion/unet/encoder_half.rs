@@ -11,42 +11,33 @@ use crate::engine::{Backend, Convolution};
 pub(crate) struct EncoderHalf<B: Backend> {
     time_embedding: TimeEmbedding<B>,
     conv_in: B::Weight,
-    steps: Vec<Step<B>>,
+    levels: Vec<Level<B>>,
     middle: [Block<B>; 2],
 }
 
-/// What makes one hidden state of the one before.
-enum Step<B: Backend> {
-    Block(Block<B>),
-    /// Halves the image.
-    Downsampling(B::Weight),
+/// The blocks of one size of image; all levels but the coarsest then halve it.
+struct Level<B: Backend> {
+    blocks: Vec<Block<B>>,
+    downsampling: Option<B::Weight>,
 }
 
 impl<B: Backend> EncoderHalf<B> {
     pub(crate) fn load(loader: &Loader<'_, B>, config: &UnetConfig) -> Result<EncoderHalf<B>> {
-        let time_embedding = TimeEmbedding::load(loader, config.block_out_channels[0])?;
-        let conv_in = loader.kernel("conv_in")?;
-        let mut steps = Vec::new();
-        for level in (0..config.block_out_channels.len()).map(|level| format!("down_blocks.{level}")) {
-            for index in 0..BLOCKS_PER_LEVEL {
-                steps.push(Step::Block(Block::load(loader, &level, index, config)?));
-            }
-            let downsampler = format!("{level}.downsamplers.0.conv");
-            if loader.has(&downsampler) {
-                steps.push(Step::Downsampling(loader.kernel(&downsampler)?));
-            }
-        }
+        let levels = 0..config.block_out_channels.len();
         let middle = |index| Block::load(loader, "mid_block", index, config);
-        Ok(EncoderHalf { time_embedding, conv_in, steps, middle: [middle(0)?, middle(1)?] })
+        Ok(EncoderHalf {
+            time_embedding: TimeEmbedding::load(loader, config.block_out_channels[0])?,
+            conv_in: loader.kernel("conv_in")?,
+            levels: levels
+                .map(|level| Level::load(loader, level, config))
+                .collect::<Result<_>>()?,
+            middle: [middle(0)?, middle(1)?],
+        })
     }
 
     /// All blocks in the order of computation.
     fn blocks(&self) -> impl Iterator<Item = &Block<B>> {
-        let way_down = self.steps.iter().filter_map(|step| match step {
-            Step::Block(block) => Some(block),
-            Step::Downsampling(_) => None,
-        });
-        way_down.chain(&self.middle)
+        self.levels.iter().flat_map(|level| &level.blocks).chain(&self.middle)
     }
 
     /// The embedding of a time of diffusion: one pixel.
@@ -80,32 +71,43 @@ impl<B: Backend> EncoderHalf<B> {
         let fused = Convolution { residual: added, ..Convolution::default() };
         let mut last = backend.convolve(latents, &self.conv_in, &fused)?;
         let mut states = Vec::new();
-        for step in &self.steps {
-            let next = step.run(backend, &last, conditioning)?;
-            states.push(std::mem::replace(&mut last, next));
+        for level in &self.levels {
+            for block in &level.blocks {
+                let next = block.run(backend, &last, conditioning)?;
+                states.push(std::mem::replace(&mut last, next));
+            }
+            if let Some(kernel) = &level.downsampling {
+                let fused = Convolution { stride: 2, ..Convolution::default() };
+                let next = backend.convolve(&last, kernel, &fused)?;
+                states.push(std::mem::replace(&mut last, next));
+            }
         }
-        let [first, second] = &self.middle;
-        let middle = first.run(backend, &last, conditioning)?;
-        let middle = second.run(backend, &middle, conditioning)?;
-        states.push(last);
-        states.push(middle);
+        let middle = self.run_middle(backend, &last, conditioning)?;
+        states.extend([last, middle]);
         Ok(states)
     }
-}
 
-impl<B: Backend> Step<B> {
-    fn run(
+    fn run_middle(
         &self,
         backend: &B,
         input: &B::Tensor,
         conditioning: &mut Conditioning<'_, B::Tensor>,
     ) -> Result<B::Tensor> {
-        match self {
-            Step::Block(block) => block.run(backend, input, conditioning),
-            Step::Downsampling(kernel) => {
-                let fused = Convolution { stride: 2, ..Convolution::default() };
-                backend.convolve(input, kernel, &fused)
-            }
-        }
+        let [first, second] = &self.middle;
+        let inner = first.run(backend, input, conditioning)?;
+        second.run(backend, &inner, conditioning)
+    }
+}
+
+impl<B: Backend> Level<B> {
+    fn load(loader: &Loader<'_, B>, level: usize, config: &UnetConfig) -> Result<Level<B>> {
+        let name = format!("down_blocks.{level}");
+        let block = |index| Block::load(loader, &name, index, config);
+        let downsampler = format!("{name}.downsamplers.0.conv");
+        let halves = loader.has(&downsampler);
+        Ok(Level {
+            blocks: (0..BLOCKS_PER_LEVEL).map(block).collect::<Result<_>>()?,
+            downsampling: if halves { Some(loader.kernel(&downsampler)?) } else { None },
+        })
     }
 }
