@@ -1,1 +1,15 @@
 //! Integration tests: golden data and real files.
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::print_stdout,
+    reason = "tests fail by panicking and say what they skip"
+)]
+
+mod checkpoint;
+mod network_shapes;
+mod networks;
+mod reference_backend;
+mod shared;
+mod text_encoder;
