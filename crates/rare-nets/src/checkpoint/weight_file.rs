@@ -35,6 +35,11 @@ impl WeightFile {
         self.length
     }
 
+    /// The open file, for a reader of its own.
+    pub(super) fn file(&self) -> &File {
+        &self.file
+    }
+
     /// Fills `buffer` with the bytes from `offset` on. A file that became shorter since it was opened is refused.
     pub(super) fn read_at(&self, buffer: &mut [u8], offset: u64) -> Result<()> {
         read_exact_at(&self.file, buffer, offset).map_err(|cause| match cause.kind() {
