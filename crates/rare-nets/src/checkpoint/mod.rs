@@ -8,6 +8,7 @@ mod element;
 mod parameters;
 mod pickle;
 mod safetensors;
+mod shards;
 mod tensor;
 mod weight_file;
 

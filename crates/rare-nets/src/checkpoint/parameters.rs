@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use rare::{Error, Result};
 
-use super::{Object, Tensor, open_pickle, safetensors};
+use super::{Object, Tensor, open_pickle, safetensors, shards};
 use crate::Parameter;
 
 /// The tensors of one network by name. Nothing is read before it is asked for.
@@ -58,6 +58,46 @@ impl Parameters {
                 "holds no dictionary of tensors, neither itself nor under state_dict or model",
             )),
         }
+    }
+
+    /// Opens a weight file of any format, by the end of its name: `.index.json` names the files of sharded weights, which
+    /// lie beside it; `.safetensors`; everything else is taken for a file of `torch.save`.
+    ///
+    /// # Errors
+    /// Those of [`Parameters::open_safetensors`] and [`Parameters::open_pickle`], and `InvalidInput` if an index does not
+    /// fit the files that it names.
+    pub fn open(path: &Path) -> Result<Parameters> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        if name.ends_with(".json") {
+            shards::open(path)
+        } else if name.ends_with(".safetensors") {
+            Parameters::open_safetensors(&[path.to_owned()])
+        } else {
+            Parameters::open_pickle(path)
+        }
+    }
+
+    /// Gives every tensor the name that `rename` makes of it, and leaves out those of which it makes none.
+    ///
+    /// # Errors
+    /// `InvalidInput` if two tensors get the same name.
+    pub fn renamed(self, rename: impl Fn(&str) -> Option<String>) -> Result<Parameters> {
+        let mut tensors: BTreeMap<String, Named> = BTreeMap::new();
+        for (name, named) in self.tensors {
+            let Some(new) = rename(&name) else { continue };
+            if let Some(other) = tensors.get(&new) {
+                let both = format!("tensors {} and {} mean the same", other.name, named.name);
+                return Err(Error::in_file(&named.file, both));
+            }
+            tensors.insert(new, named);
+        }
+        Ok(Parameters { tensors, ..self })
+    }
+
+    /// Whether there is a tensor `name`.
+    #[must_use]
+    pub fn contains(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
     }
 
     fn from_tensors(
