@@ -119,6 +119,17 @@ fn the_controlnet_may_keep_its_own_name() {
 }
 
 #[test]
+fn a_text_encoder_without_prefix_opens() {
+    // As version 5 of the transformers library writes it.
+    let Some(tiny) = Tiny::copied() else { return };
+    let tensors = tiny.tensors("text_encoder").into_iter();
+    let tensors =
+        tensors.map(|(name, raw)| (name["text_model.".len()..].to_owned(), raw)).collect();
+    tiny.write("text_encoder/model.safetensors", &safetensors(&tensors, None));
+    check(&tiny, &open(tiny.path()));
+}
+
+#[test]
 fn variants_shards_and_pickles_open() {
     let Some(tiny) = Tiny::copied() else { return };
     let unet = tiny.tensors("unet");
