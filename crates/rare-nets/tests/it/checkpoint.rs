@@ -7,8 +7,6 @@ use rare_nets::checkpoint::Parameters;
 use rare_nets::{Parameter, Values};
 use tempfile::TempDir;
 
-use crate::shared;
-
 mod pickle;
 
 /// A file with these bytes, in a folder that goes when the test ends.
@@ -155,19 +153,6 @@ fn files_are_put_together_unless_they_share_a_name() {
     let again = with("a", 3.0);
     let message = Parameters::open_safetensors(&[first.1, again.1]).unwrap_err().to_string();
     assert!(message.contains("tensor a is also in"), "{message}");
-}
-
-#[test]
-fn the_tiny_unet_opens() {
-    let Some(path) =
-        shared::path("golden/rare/tiny-pipeline/unet/diffusion_pytorch_model.safetensors")
-    else {
-        return;
-    };
-    let parameters = Parameters::open_safetensors(&[path]).unwrap();
-    assert_eq!(parameters.names().count(), 686);
-    let weight = parameters.read("conv_in.weight", &[16, 4, 3, 3]).unwrap();
-    assert_eq!(weight.to_f32().len(), 576);
 }
 
 proptest! {
