@@ -16,3 +16,7 @@ pub use layout::{
 };
 pub use text_encoder::TextEncoder;
 pub use unet::{Extent, LAYERS, Output, Unet};
+mod pipeline;
+
+pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
+pub use pipeline::{Pipeline, TokenizerFiles};

@@ -11,5 +11,6 @@ mod checkpoint;
 mod network_shapes;
 mod networks;
 mod reference_backend;
+mod pipeline;
 mod shared;
 mod text_encoder;
