@@ -8,6 +8,8 @@ use tempfile::TempDir;
 
 use crate::shared;
 
+mod pickle;
+
 /// A file with these bytes, in a folder that goes when the test ends.
 fn file(bytes: &[u8]) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
