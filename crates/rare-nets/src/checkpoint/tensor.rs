@@ -11,7 +11,7 @@ use super::weight_file::WeightFile;
 use crate::{Parameter, Values};
 
 /// Elements that one thread reads and converts at a time: few enough that the bytes stay in its cache.
-const CHUNK: usize = 1 << 17;
+const CHUNK: usize = 1 << 15;
 
 /// Elements that a tensor may have beyond those that are stored, by repeating them (a stride of 0).
 const MOST_REPEATED: usize = 1 << 24;
@@ -185,8 +185,8 @@ impl Tensor {
 
     fn widened<T: Copy + Default + Send, U, const SIZE: usize>(
         &self,
-        convert: fn([u8; SIZE]) -> T,
-        widen: fn(T) -> U,
+        convert: impl Fn([u8; SIZE]) -> T + Sync,
+        widen: impl Fn(T) -> U,
     ) -> Result<Vec<U>> {
         Ok(self.decode(convert, |_| true)?.0.into_iter().map(widen).collect())
     }
@@ -194,8 +194,8 @@ impl Tensor {
     /// Reads and converts all elements and counts those that are not `finite`.
     fn decode<T: Copy + Default + Send, const SIZE: usize>(
         &self,
-        convert: fn([u8; SIZE]) -> T,
-        finite: fn(T) -> bool,
+        convert: impl Fn([u8; SIZE]) -> T + Sync,
+        finite: impl Fn(T) -> bool + Sync,
     ) -> Result<(Vec<T>, usize)> {
         match &self.layout {
             Layout::RowMajor => self.bytes.decode(self.count(), convert, finite),
@@ -213,16 +213,16 @@ impl Bytes {
     fn decode<T: Copy + Default + Send, const SIZE: usize>(
         &self,
         count: usize,
-        convert: fn([u8; SIZE]) -> T,
-        finite: fn(T) -> bool,
+        convert: impl Fn([u8; SIZE]) -> T + Sync,
+        finite: impl Fn(T) -> bool + Sync,
     ) -> Result<(Vec<T>, usize)> {
         let mut values = vec![T::default(); count];
         let bad = values
             .par_chunks_mut(CHUNK)
             .enumerate()
-            .map(|(index, chunk)| {
-                let mut bytes = vec![0; chunk.len() * SIZE];
-                self.fill(&mut bytes, (index * CHUNK * SIZE) as u64)?;
+            .map_init(Vec::new, |bytes, (index, chunk)| {
+                bytes.resize(chunk.len() * SIZE, 0);
+                self.fill(bytes, (index * CHUNK * SIZE) as u64)?;
                 if self.big_endian {
                     bytes.chunks_exact_mut(SIZE).for_each(<[u8]>::reverse);
                 }

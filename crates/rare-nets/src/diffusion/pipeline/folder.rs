@@ -25,7 +25,16 @@ pub(super) fn text_encoder(places: &Places) -> Result<Network<TextConfig>> {
     let Some(folder) = places.folder("text_encoder") else {
         return Err(places.missing("text encoder", "text_encoder/"));
     };
-    network(&folder, &files::TEXT_MODEL, versions::text_encoder)
+    let text = network(&folder, &files::TEXT_MODEL, versions::text_encoder)?;
+    Ok(Network { parameters: with_text_prefix(text.parameters)?, ..text })
+}
+
+/// Version 5 of the transformers library leaves out the prefix that all files before it have.
+pub(super) fn with_text_prefix(parameters: Parameters) -> Result<Parameters> {
+    if !parameters.contains("embeddings.token_embedding.weight") {
+        return Ok(parameters);
+    }
+    parameters.renamed(|name| Some(format!("text_model.{name}")))
 }
 
 /// The `ControlNet`; `None` if there is none in this layout.

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use rare::{Error, Result};
 
+use super::folder::with_text_prefix;
 use super::places::{Places, entries};
 use super::{Network, ldm_names, versions};
 use crate::checkpoint::Parameters;
@@ -39,6 +40,7 @@ pub(super) fn base(places: &Places) -> Result<Base> {
     refuse_other_models(&path, &file)?;
     let unet = file.clone().renamed(|name| ldm_names::unet(name.strip_prefix(UNET)?))?;
     let text = file.renamed(|name| name.strip_prefix(TEXT).map(str::to_owned))?;
+    let text = with_text_prefix(text)?;
     let network =
         Network { config: unet_config(&path, &unet)?, parameters: unet, config_file: None };
     let text = Network { config: text_config(&path, &text)?, parameters: text, config_file: None };

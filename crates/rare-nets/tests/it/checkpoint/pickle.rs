@@ -118,6 +118,47 @@ fn arrays_of_other_orders_read() {
     assert!(array.read_f64().unwrap_err().to_string().contains("I16"));
 }
 
+/// An old stream with one storage of five numbers, 0 to 4, of which the tensor takes what `view`, `offset`, `shape` and
+/// `strides` say.
+fn stream(view: &[u8], offset: u8, shape: &[u8], strides: &[u8]) -> Vec<u8> {
+    let sizes = |sizes: &[u8]| {
+        let sizes: Vec<u8> = sizes.iter().flat_map(|&size| [b'K', size]).collect();
+        [b"(".as_slice(), &sizes, b"t"].concat()
+    };
+    let mut bytes =
+        b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}.".to_vec();
+    bytes.extend(b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((U\x07storagectorch\nFloatStorage\nU\x01kU\x03cpuK\x05");
+    bytes.extend([view, b"tQK", &[offset], &sizes(shape), &sizes(strides)].concat());
+    bytes.extend(b"\x89)tR.\x80\x02]U\x01ka.\x05\0\0\0\0\0\0\0");
+    bytes.extend((0..5).flat_map(|value| (value as f32).to_le_bytes()));
+    bytes
+}
+
+#[test]
+fn parts_of_a_storage_read() {
+    for (view, offset, shape, strides, expected) in [
+        (&b"N"[..], 0, &[5][..], &[1][..], &[0.0, 1.0, 2.0, 3.0, 4.0][..]),
+        (b"N", 1, &[2, 2], &[1, 2], &[1.0, 3.0, 2.0, 4.0]),
+        (b"N", 4, &[1, 3], &[9, 0], &[4.0, 4.0, 4.0]),
+        (b"N", 5, &[0, 2], &[1, 1], &[]),
+        (b"(U\x01vK\x02K\x03t", 1, &[2], &[1], &[3.0, 4.0]),
+    ] {
+        let object = opened(&stream(view, offset, shape, strides)).unwrap();
+        assert_eq!(object.tensor().unwrap().read_f64().unwrap(), expected);
+    }
+    for (view, offset, shape, strides) in [
+        (&b"N"[..], 0, &[6][..], &[1][..]),
+        (b"N", 1, &[5], &[1]),
+        (b"N", 0, &[2, 2], &[4, 1]),
+        (b"N", 0, &[2], &[1, 1]),
+        (b"(U\x01vK\x02K\x03t", 0, &[4], &[1]),
+        (b"N", 0, &[255, 255, 255, 255], &[0, 0, 0, 0]),
+    ] {
+        let message = refusal(&stream(view, offset, shape, strides));
+        assert!(message.contains("does not fit its storage"), "{message}");
+    }
+}
+
 #[test]
 fn integers_of_every_width_read() {
     for (pickle, value) in [
@@ -183,7 +224,7 @@ fn malformed_pickles_are_refused() {
     for (pickle, word) in [
         (&b""[..], "neither"),
         (b"<!DOCTYPE html>", "neither"),
-        (b"version https://git-lfs.github.com/spec/v1", "neither"),
+        (b"version https://git-lfs.github.com/spec/v1", "git lfs pull"),
         (b"\x80\x02", "truncated"),
         (b"\x80\x02.", "stack"),
         (b"\x80\x02N(.", "stack"),
