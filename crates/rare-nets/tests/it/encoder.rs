@@ -70,7 +70,6 @@ fn noise_depends_on_seed_view_and_cloud() {
     let settings = DiffusionSettings { layers: vec![3], ..DiffusionSettings::default() };
     let maps = vec![map(64, 64, 0); 4];
     let own = encode(&pipeline, &settings, &maps);
-    assert_eq!(own, encode(&pipeline, &settings, &maps));
     for (at, layers) in own.iter().enumerate() {
         assert!(own[..at].iter().all(|other| other != layers));
     }
@@ -78,8 +77,8 @@ fn noise_depends_on_seed_view_and_cloud() {
     let shared = encode(&pipeline, &shared, &maps);
     assert_eq!((&shared[0], &shared[2]), (&own[0], &own[2]));
     assert_eq!((&shared[1], &shared[3]), (&own[0], &own[2]));
-    let other = encode(&pipeline, &DiffusionSettings { seed: 1, ..settings }, &maps);
-    assert!(other.iter().zip(&own).all(|(other, own)| other != own));
+    let other = encode(&pipeline, &DiffusionSettings { seed: 1, ..settings }, &maps[..1]);
+    assert!(own.iter().all(|own| *own != other[0]));
 }
 
 #[test]
