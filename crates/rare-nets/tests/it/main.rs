@@ -8,9 +8,14 @@
 )]
 
 mod checkpoint;
+mod encoder;
 mod network_shapes;
 mod networks;
+mod pipeline;
 mod reference_backend;
 mod pipeline;
+mod sampler;
+mod schedule;
 mod shared;
 mod text_encoder;
+mod tokenizer;
