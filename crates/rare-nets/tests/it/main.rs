@@ -13,7 +13,6 @@ mod network_shapes;
 mod networks;
 mod pipeline;
 mod reference_backend;
-mod pipeline;
 mod sampler;
 mod schedule;
 mod shared;
