@@ -86,6 +86,11 @@ impl DepthFeatures {
 }
 
 impl DepthEncoder for DepthFeatures {
+    fn encode_map(&self, _index: usize, map: &DepthMap) -> Result<LayeredFeatures> {
+        self.validate()?;
+        Ok(vec![self.describe(map, &Cosines::new(self.lattice, self.frequencies))?])
+    }
+
     fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
         self.validate()?;
         let cosines = Cosines::new(self.lattice, self.frequencies);
