@@ -62,7 +62,7 @@ fn untimed(refinement: Refinement) -> Refinement {
 
 /// A run with features that `record` made and one with `use_again`'s settings on them.
 #[track_caller]
-fn assert_the_same(record: &Refiner, config: RefinerConfig, views: usize) {
+fn assert_the_same(record: &Refiner, config: &RefinerConfig, views: usize) {
     let pair = pair();
     let (source, target, initial) = (&pair.source, &pair.target, &pair.truth.initial);
     let direct = record.refine(source, target, initial).unwrap();
@@ -76,7 +76,8 @@ fn assert_the_same(record: &Refiner, config: RefinerConfig, views: usize) {
         assert!(names.contains(&format!("{name}_layer0")), "{name} is not in {names:?}");
     }
     let recipe = config.recipe.clone().for_recorded(&read);
-    let again = Refiner::new(RefinerConfig { recipe, ..config }).with_encoder(Box::new(read));
+    let again =
+        Refiner::new(RefinerConfig { recipe, ..config.clone() }).with_encoder(Box::new(read));
     let again = again.refine(source, target, initial).unwrap();
     assert_eq!(again.target_from_source, direct.target_from_source);
     assert!(untimed(again) == untimed(direct), "the evidence differs");
@@ -86,13 +87,13 @@ fn assert_the_same(record: &Refiner, config: RefinerConfig, views: usize) {
 fn recorded_features_give_the_identical_refinement() {
     let config = one_round(CameraChoice::Sensor);
     assert_eq!(map_names(2), MAP_NAMES);
-    assert_the_same(&Refiner::new(config.clone()), config, 2);
+    assert_the_same(&Refiner::new(config.clone()), &config, 2);
 }
 
 #[test]
 fn so_do_those_of_six_cameras_per_cloud() {
     let config = one_round(CameraChoice::Overlap);
-    assert_the_same(&Refiner::new(config.clone()), config, 12);
+    assert_the_same(&Refiner::new(config.clone()), &config, 12);
 }
 
 /// The reduction is that of the recording, whatever the recipe of the later run says.
@@ -102,7 +103,7 @@ fn so_do_several_layers_that_are_reduced() {
     let recipe = Recipe { components: Some(2), ..config.recipe.clone().for_network() };
     let network = RefinerConfig { recipe, ..config.clone() };
     let record = Refiner::new(network).with_encoder(Box::new(Layers::default()));
-    assert_the_same(&record, config, 2);
+    assert_the_same(&record, &config, 2);
 }
 
 #[test]
