@@ -1,1 +1,12 @@
 //! Integration tests: golden data and real files.
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::print_stdout,
+    reason = "tests fail by panicking and say what they skip"
+)]
+
+mod schedule;
+mod shared;
+mod tokenizer;
