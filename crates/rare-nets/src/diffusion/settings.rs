@@ -7,6 +7,8 @@ use rare::scale::SceneKind;
 use rare::{Error, Result};
 use serde::{Deserialize, Serialize};
 
+use super::LAYERS;
+
 /// The prompt for rooms and objects (FreeReg's).
 pub const INDOOR_PROMPT: &str = "a photo of a room, furniture, household items, best quality";
 
@@ -16,9 +18,6 @@ pub const STREET_PROMPT: &str =
 
 /// What the pictures shall not be (FreeReg's negative prompt).
 pub const NEGATIVE_PROMPT: &str = "lowres, bad anatomy, bad hands, cropped, worst quality";
-
-/// Number of layers that features can be taken from: the middle block, and the 12 blocks of the decoder.
-pub const LAYERS: usize = 13;
 
 /// Largest guidance; far below it the pictures are burnt already.
 const MOST_GUIDANCE: f32 = 100.0;

@@ -7,6 +7,11 @@
     reason = "tests fail by panicking and say what they skip"
 )]
 
+mod checkpoint;
+mod network_shapes;
+mod networks;
+mod reference_backend;
 mod schedule;
 mod shared;
+mod text_encoder;
 mod tokenizer;

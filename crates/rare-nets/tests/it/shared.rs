@@ -84,6 +84,13 @@ impl Golden {
             npyz::Order::Fortran => Array { values: transposed(&shape, &values), shape },
         }
     }
+
+    /// The names of all arrays, sorted.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let mut names: Vec<String> = self.archive.array_names().map(str::to_owned).collect();
+        names.sort();
+        names
+    }
 }
 
 /// The values of a two-dimensional array in Fortran order, in C order.
