@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 mod args;
+mod memory;
 mod options;
 mod outputs;
 mod progress;
