@@ -15,3 +15,9 @@ mod schedule;
 mod shared;
 mod text_encoder;
 mod tokenizer;
+#![allow(clippy::unwrap_used, clippy::panic)]
+
+#[cfg(feature = "fetch")]
+mod weights;
+#[cfg(feature = "fetch")]
+mod weights_server;
