@@ -205,7 +205,8 @@ impl Totals {
 }
 
 fn line(before: &PoseError, after: &PoseError, solved: bool, result: &Refinement) -> String {
-    let error = |error: &PoseError| format!("{:6.2} {:6.3}", error.rotation_degrees, error.translation);
+    let error =
+        |error: &PoseError| format!("{:6.2} {:6.3}", error.rotation_degrees, error.translation);
     let consistency = &result.consistency;
     format!(
         "{} -> {} {} {:9} conf {:.2} ov {:.2} inl {}/{} agree {} occ {} viol {} seen {} truth",

@@ -139,16 +139,27 @@ impl<E: DepthEncoder> CachedEncoder<E> {
 }
 
 impl<E: DepthEncoder> DepthEncoder for CachedEncoder<E> {
-    fn encode_map(&self, index: usize, map: &DepthMap) -> Result<LayeredFeatures> {
-        let key = self.key(index, map);
-        if let Some(features) = self.load(&key) {
-            self.found.fetch_add(1, Ordering::Relaxed);
-            return Ok(features);
-        }
-        let features = self.encoder.encode_map(index, map)?;
-        self.computed.fetch_add(1, Ordering::Relaxed);
-        self.store(&key, &features);
-        Ok(features)
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>> {
+        let keys: Vec<Digest> = maps.iter().map(|&(index, map)| self.key(index, map)).collect();
+        let known: Vec<Option<LayeredFeatures>> = keys.iter().map(|key| self.load(key)).collect();
+        let unknown = maps.iter().zip(&known).filter(|(_, known)| known.is_none());
+        let unknown: Vec<(usize, &DepthMap)> = unknown.map(|(&map, _)| map).collect();
+        self.found.fetch_add(maps.len() - unknown.len(), Ordering::Relaxed);
+        let computed =
+            if unknown.is_empty() { Vec::new() } else { self.encoder.encode_at(&unknown)? };
+        self.computed.fetch_add(computed.len(), Ordering::Relaxed);
+        let mut computed = computed.into_iter();
+        let complete = |(key, known): (&Digest, Option<LayeredFeatures>)| match known {
+            Some(features) => Ok(features),
+            None => {
+                let features = computed.next().ok_or_else(|| {
+                    Error::Internal(format!("an encoder left out some of {} maps", maps.len()))
+                })?;
+                self.store(key, &features);
+                Ok(features)
+            }
+        };
+        keys.iter().zip(known).map(complete).collect()
     }
 }
 
@@ -183,9 +194,12 @@ mod tests {
     struct Echo;
 
     impl DepthEncoder for Echo {
-        fn encode_map(&self, index: usize, map: &DepthMap) -> Result<LayeredFeatures> {
-            let layer = |value: f32| FeatureMap::new(2, 1, 1, vec![value, map.at(0, 0)]);
-            Ok(vec![layer(index as f32)?, layer(-0.0)?])
+        fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>> {
+            let of_map = |&(index, map): &(usize, &DepthMap)| {
+                let layer = |value: f32| FeatureMap::new(2, 1, 1, vec![value, map.at(0, 0)]);
+                Ok(vec![layer(index as f32)?, layer(-0.0)?])
+            };
+            maps.iter().map(of_map).collect()
         }
     }
 
@@ -228,7 +242,7 @@ mod tests {
         let closer = Intrinsics { fx: 586.0, ..*map(1.0).intrinsics() };
         let closer = DepthMap::new(closer, map(1.0).depth().to_vec()).unwrap();
         for map in [map(1.0), closer, map(1.0 + f32::EPSILON)] {
-            encoder.encode_map(0, &map).unwrap();
+            encoder.encode_at(&[(0, &map)]).unwrap();
         }
         assert_eq!(encoder.computed(), 3);
     }
@@ -236,7 +250,7 @@ mod tests {
     #[test]
     fn damaged_entries_are_computed_anew_and_replaced() {
         let folder = tempfile::tempdir().unwrap();
-        in_folder(folder.path(), "a").encode_map(0, &map(1.0)).unwrap();
+        in_folder(folder.path(), "a").encode_at(&[(0, &map(1.0))]).unwrap();
         let file = fs::read_dir(folder.path()).unwrap().next().unwrap().unwrap().path();
         let whole = fs::read(&file).unwrap();
         let mut flipped = whole.clone();
@@ -246,8 +260,8 @@ mod tests {
             fs::write(&file, damaged).unwrap();
             let encoder = in_folder(folder.path(), "a");
             assert_eq!(
-                encoder.encode_map(0, &map(1.0)).unwrap(),
-                Echo.encode_map(0, &map(1.0)).unwrap()
+                encoder.encode_at(&[(0, &map(1.0))]).unwrap(),
+                Echo.encode_at(&[(0, &map(1.0))]).unwrap()
             );
             assert_eq!((encoder.computed(), encoder.found()), (1, 0));
             let trouble = encoder.trouble().unwrap();
@@ -262,7 +276,7 @@ mod tests {
         let cache = folder.path().join("cache");
         let encoder = in_folder(&cache, "a");
         fs::remove_dir(&cache).unwrap();
-        assert!(encoder.encode_map(0, &map(1.0)).is_ok());
+        assert!(encoder.encode_at(&[(0, &map(1.0))]).is_ok());
         assert!(encoder.trouble().unwrap().contains("cache"));
         fs::write(&cache, "a file").unwrap();
         for place in [cache.clone(), cache.join("below")] {

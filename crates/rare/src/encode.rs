@@ -24,27 +24,27 @@ pub const MAP_NAMES: [&str; 4] = ["refview_ref", "refview_src", "srcview_ref", "
 /// source cloud (see [`MAP_NAMES`]). So the map at position `index` is seen by view `index / 2` and shows the reference
 /// if `index` is even. An encoder that draws random numbers takes its stream from the position.
 pub trait DepthEncoder: Send + Sync {
-    /// Encodes the map at position `index`. All maps get the same number of layers.
+    /// Encodes some of the maps of a registration, each with its position: one [`LayeredFeatures`] per map in the order
+    /// given, all with the same number of layers. What is made of a map does not depend on the others.
     ///
     /// # Errors
     /// Whatever keeps the encoder from working, in the words of [`crate::Error`].
-    fn encode_map(&self, index: usize, map: &DepthMap) -> Result<LayeredFeatures>;
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>>;
 
-    /// Encodes all maps of one registration, one [`LayeredFeatures`] per map in their order: what
-    /// [`DepthEncoder::encode_map`] makes of each. An encoder that does several at a time, or wants to see them all
-    /// first, has its own.
+    /// Encodes all maps of one registration, in their order.
     ///
     /// # Errors
-    /// As [`DepthEncoder::encode_map`].
+    /// As [`DepthEncoder::encode_at`].
     fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
-        maps.iter().enumerate().map(|(index, map)| self.encode_map(index, map)).collect()
+        let numbered: Vec<(usize, &DepthMap)> = maps.iter().enumerate().collect();
+        self.encode_at(&numbered)
     }
 }
 
 /// An encoder that its owner goes on asking questions while a [`crate::Refiner`] uses it.
 impl<E: DepthEncoder + ?Sized> DepthEncoder for Arc<E> {
-    fn encode_map(&self, index: usize, map: &DepthMap) -> Result<LayeredFeatures> {
-        (**self).encode_map(index, map)
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>> {
+        (**self).encode_at(maps)
     }
 
     fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {

@@ -144,17 +144,21 @@ impl Recorded {
 }
 
 impl DepthEncoder for Recorded {
-    fn encode_map(&self, index: usize, map: &DepthMap) -> Result<LayeredFeatures> {
-        let layers = self.features.get(index).ok_or_else(|| self.wrong_count(index + 1))?;
-        self.check_map(index, map)?;
-        Ok(layers.clone())
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>> {
+        let of_map = |&(index, map): &(usize, &DepthMap)| {
+            let layers = self.features.get(index).ok_or_else(|| self.wrong_count(index + 1))?;
+            self.check_map(index, map)?;
+            Ok(layers.clone())
+        };
+        maps.iter().map(of_map).collect()
     }
 
     fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
         if maps.len() != self.features.len() {
             return Err(self.wrong_count(maps.len()));
         }
-        maps.iter().enumerate().map(|(index, map)| self.encode_map(index, map)).collect()
+        let numbered: Vec<(usize, &DepthMap)> = maps.iter().enumerate().collect();
+        self.encode_at(&numbered)
     }
 }
 
@@ -310,15 +314,15 @@ mod tests {
             let intrinsics = Intrinsics { width, height: 4 / width, ..Intrinsics::indoor() };
             DepthMap::new(intrinsics, depths.to_vec()).unwrap()
         };
-        assert!(recorded.encode_map(3, &map(2, [1.0, 2.0, 1.51, 0.0])).is_ok());
+        assert!(recorded.encode_at(&[(3, &map(2, [1.0, 2.0, 1.51, 0.0]))]).is_ok());
         for other in [
             map(2, [1.0, 2.0, 1.6, 0.0]),
             map(2, [1.0, 2.0, 1.5, 1.5]),
             map(1, [1.0, 2.0, 1.5, 0.0]),
         ] {
-            let message = recorded.encode_map(3, &other).unwrap_err().to_string();
+            let message = recorded.encode_at(&[(3, &other)]).unwrap_err().to_string();
             assert!(message.contains("view1_src") && message.contains("voxel"), "{message}");
         }
-        assert!(recorded.encode_map(6, &map(2, [1.0; 4])).is_err());
+        assert!(recorded.encode_at(&[(6, &map(2, [1.0; 4]))]).is_err());
     }
 }

@@ -113,8 +113,12 @@ impl Refiner {
         pair: &WorkingPair<'_>,
         maps: &[DepthMap],
     ) -> Result<Vec<LayeredFeatures>> {
-        let Some(encoder) = &self.encoder else { return self.encode(pair, maps) };
-        maps.iter().enumerate().map(|(view, map)| encoder.encode_map(2 * view, map)).collect()
+        let placed: Vec<(usize, &DepthMap)> =
+            maps.iter().enumerate().map(|(view, map)| (2 * view, map)).collect();
+        match &self.encoder {
+            Some(encoder) => encoder.encode_at(&placed),
+            None => DepthFeatures::for_voxel(pair.scale.voxel).encode_at(&placed),
+        }
     }
 
     /// The paper sees a street through KITTI's colour camera; everything else chooses by the kind of scene.

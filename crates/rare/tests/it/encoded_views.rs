@@ -33,6 +33,12 @@ struct Layers {
 }
 
 impl DepthEncoder for Layers {
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> rare::Result<Vec<LayeredFeatures>> {
+        maps.iter().map(|&(index, map)| self.encode_map(index, map)).collect()
+    }
+}
+
+impl Layers {
     fn encode_map(&self, index: usize, map: &DepthMap) -> rare::Result<LayeredFeatures> {
         self.positions.lock().unwrap().push(index);
         let layer = |cell: usize| {

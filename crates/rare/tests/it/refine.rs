@@ -283,6 +283,12 @@ struct Positions {
 }
 
 impl DepthEncoder for Positions {
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> rare::Result<Vec<LayeredFeatures>> {
+        maps.iter().map(|&(index, map)| self.encode_map(index, map)).collect()
+    }
+}
+
+impl Positions {
     fn encode_map(&self, index: usize, map: &DepthMap) -> rare::Result<LayeredFeatures> {
         let common_from_camera = &self.common_from_camera[index];
         let (columns, rows) = (map.width() / 10, map.height() / 10);
