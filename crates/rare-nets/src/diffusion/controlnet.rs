@@ -73,7 +73,7 @@ impl<B: Backend> ControlNet<B> {
         let shape = backend.shape(hint);
         let Shape { height, width, channels, .. } = shape;
         let divisible = height.is_multiple_of(HINT_SCALE) && width.is_multiple_of(HINT_SCALE);
-        if !divisible || channels != self.config.hint_channels {
+        if shape.values() == 0 || !divisible || channels != self.config.hint_channels {
             return Err(Error::Internal(format!(
                 "depth images {shape:?}: height and width must be multiples of {HINT_SCALE}, and {} the number of channels",
                 self.config.hint_channels

@@ -96,11 +96,12 @@ impl<B: Backend> Unet<B> {
         parameters: &Parameters,
         extent: Extent,
     ) -> Result<Unet<B>> {
+        let blocks = extent.blocks()?;
         check_config(config)?;
         let layout = unet_layout(config);
         let loader = Loader::new(backend, &layout, parameters, "U-Net")?;
         let encoder = EncoderHalf::load(&loader, config)?;
-        let decoder = (0..extent.blocks()?)
+        let decoder = (0..blocks)
             .map(|block| (block / (BLOCKS_PER_LEVEL + 1), block % (BLOCKS_PER_LEVEL + 1)))
             .map(|(level, index)| DecoderBlock::load(&loader, level, index, config))
             .collect::<Result<Vec<DecoderBlock<B>>>>()?;
