@@ -15,8 +15,6 @@ mod schedule;
 mod shared;
 mod text_encoder;
 mod tokenizer;
-#![allow(clippy::unwrap_used, clippy::panic)]
-
 #[cfg(feature = "fetch")]
 mod weights;
 #[cfg(feature = "fetch")]
