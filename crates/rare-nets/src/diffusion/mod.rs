@@ -20,7 +20,7 @@ pub use layout::{
     Differences, Layout, Misshapen, compare, controlnet_layout, text_encoder_layout, unet_layout,
 };
 pub use noise::Noise;
-pub use sampler::Plan;
+pub use sampler::{Hints, Networks, Plan, Prediction, Sampler};
 pub use schedule::{Schedule, Step, cumulative_alphas};
 pub use settings::{
     DiffusionSettings, INDOOR_PROMPT, NEGATIVE_PROMPT, Precision, Preset, STREET_PROMPT,

@@ -153,12 +153,6 @@ impl DiffusionSettings {
         self.prompt.as_deref().unwrap_or(INDOOR_PROMPT)
     }
 
-    /// Whether every step also asks the network for the unconditional noise.
-    #[must_use]
-    pub fn guided(&self) -> bool {
-        self.guidance != 1.0
-    }
-
     /// Makes sure that guidance and layers are possible. Time and steps depend on the noise schedule of the pipeline and
     /// are checked by [`super::Plan::new`], prompts on its vocabulary.
     ///

@@ -11,6 +11,7 @@ mod checkpoint;
 mod network_shapes;
 mod networks;
 mod reference_backend;
+mod sampler;
 mod schedule;
 mod shared;
 mod text_encoder;

@@ -3,7 +3,7 @@
 use rare::{Error, Result};
 
 use crate::diffusion::schedule::{Schedule, Step, cumulative_alphas};
-use crate::diffusion::{DiffusionSettings, SchedulerConfig};
+use crate::diffusion::{DiffusionSettings, Extent, SchedulerConfig};
 
 /// The way from noise to features (paper section "Depth Diffusion Feature Extraction").
 #[derive(Debug, Clone, PartialEq)]
@@ -12,10 +12,12 @@ pub struct Plan {
     pub noise_scale: f64,
     /// The steps, in order.
     pub steps: Vec<Step>,
-    /// Guidance of the steps; `None` asks for the conditional noise alone.
+    /// Guidance of the steps; `None` where it is 1 or there are no steps, so that the conditional noise is all.
     pub guidance: Option<f32>,
     /// The time that the network is told when the features are read.
     pub time: usize,
+    /// The layers that are read, ascending.
+    pub layers: Vec<usize>,
 }
 
 impl Plan {
@@ -26,16 +28,31 @@ impl Plan {
     /// or if `time` is not a time of the schedule.
     pub fn new(settings: &DiffusionSettings, config: &SchedulerConfig) -> Result<Plan> {
         settings.validate()?;
-        let guidance = settings.guided().then_some(settings.guidance);
+        let layers = settings.layers.clone();
         if settings.steps == 0 {
             let noise_scale = noise_at(settings.time, config)?;
-            return Ok(Plan { noise_scale, steps: Vec::new(), guidance, time: settings.time });
+            let (steps, time) = (Vec::new(), settings.time);
+            return Ok(Plan { noise_scale, steps, guidance: None, time, layers });
         }
         let mut schedule = Schedule::new(config, settings.steps)?;
         let index = schedule.feature_index(settings.time)?;
         let time = schedule.feature_time(index);
         schedule.steps.truncate(index);
-        Ok(Plan { noise_scale: 1.0, steps: schedule.steps, guidance, time })
+        let guided = settings.guidance != 1.0 && index > 0;
+        let guidance = guided.then_some(settings.guidance);
+        Ok(Plan { noise_scale: 1.0, steps: schedule.steps, guidance, time, layers })
+    }
+
+    /// The last layer that is read.
+    #[must_use]
+    pub fn last_layer(&self) -> usize {
+        self.layers.last().copied().unwrap_or_default()
+    }
+
+    /// How much of the U-Net is needed: everything for steps, otherwise what leads to the last layer.
+    #[must_use]
+    pub fn extent(&self) -> Extent {
+        if self.steps.is_empty() { Extent::UpToLayer(self.last_layer()) } else { Extent::Whole }
     }
 
     /// How many images pass the networks in one step per map: conditional, and with guidance unconditional.
