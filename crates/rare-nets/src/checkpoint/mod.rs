@@ -6,10 +6,13 @@
 
 mod element;
 mod parameters;
+mod pickle;
 mod safetensors;
+mod shards;
 mod tensor;
 mod weight_file;
 
 pub use element::ElementType;
 pub use parameters::Parameters;
+pub use pickle::{Instance, Object, open_pickle};
 pub use tensor::Tensor;

@@ -22,7 +22,24 @@ impl WeightFile {
         if !metadata.is_file() {
             return Err(Error::in_file(path, "is not a regular file"));
         }
-        Ok(WeightFile { path: path.to_owned(), file, length: metadata.len() })
+        let opened = WeightFile { path: path.to_owned(), file, length: metadata.len() };
+        opened.refuse_pointer()?;
+        Ok(opened)
+    }
+
+    /// A clone of a repository without Git LFS has small texts in place of the weights.
+    fn refuse_pointer(&self) -> Result<()> {
+        const POINTER: &[u8] = b"version https://git-lfs";
+        let mut start = [0; POINTER.len()];
+        if self.length < POINTER.len() as u64 {
+            return Ok(());
+        }
+        self.read_at(&mut start, 0)?;
+        if start == POINTER {
+            let what = "is a pointer of Git LFS, not the file itself: fetch that with git lfs pull";
+            return Err(Error::in_file(&self.path, what));
+        }
+        Ok(())
     }
 
     /// Where it was opened.
@@ -33,6 +50,11 @@ impl WeightFile {
     /// Bytes at the time of opening.
     pub(super) fn length(&self) -> u64 {
         self.length
+    }
+
+    /// The open file, for a reader of its own.
+    pub(super) fn file(&self) -> &File {
+        &self.file
     }
 
     /// Fills `buffer` with the bytes from `offset` on. A file that became shorter since it was opened is refused.

@@ -28,3 +28,7 @@ pub use settings::{
 pub use text_encoder::TextEncoder;
 pub use tokenizer::{PROMPT_LENGTH, Tokenizer, Tokens, known_tokens};
 pub use unet::{Extent, LAYERS, Output, Unet};
+mod pipeline;
+
+pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
+pub use pipeline::{Pipeline, TokenizerFiles};

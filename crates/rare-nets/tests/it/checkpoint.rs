@@ -2,11 +2,12 @@
 
 use std::path::PathBuf;
 
+use proptest::prelude::*;
 use rare_nets::checkpoint::Parameters;
 use rare_nets::{Parameter, Values};
 use tempfile::TempDir;
 
-use crate::shared;
+mod pickle;
 
 /// A file with these bytes, in a folder that goes when the test ends.
 fn file(bytes: &[u8]) -> (TempDir, PathBuf) {
@@ -154,15 +155,31 @@ fn files_are_put_together_unless_they_share_a_name() {
     assert!(message.contains("tensor a is also in"), "{message}");
 }
 
-#[test]
-fn the_tiny_unet_opens() {
-    let Some(path) =
-        shared::path("golden/rare/tiny-pipeline/unet/diffusion_pytorch_model.safetensors")
-    else {
-        return;
-    };
-    let parameters = Parameters::open_safetensors(&[path]).unwrap();
-    assert_eq!(parameters.names().count(), 686);
-    let weight = parameters.read("conv_in.weight", &[16, 4, 3, 3]).unwrap();
-    assert_eq!(weight.to_f32().len(), 576);
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn damaged_safetensors_do_no_harm(
+        changes in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..6),
+        length in prop::option::of(any::<prop::sample::Index>()),
+    ) {
+        let header = r#"{"a":{"dtype":"F32","shape":[2],"data_offsets":[0,8]},"b":{"dtype":"F16","shape":[1,2],"data_offsets":[8,12]}}"#;
+        let mut bytes = safetensors(header, &[0; 12]);
+        for (place, byte) in changes {
+            let place = place.index(bytes.len());
+            bytes[place] = byte;
+        }
+        if let Some(length) = length {
+            bytes.truncate(length.index(bytes.len()));
+        }
+        let (_folder, path) = file(&bytes);
+        if let Ok(parameters) = Parameters::open_safetensors(&[path]) {
+            for name in parameters.names() {
+                let shape = parameters.shape(name).unwrap();
+                if let Ok(read) = parameters.read(name, shape) {
+                    prop_assert_eq!(read.to_f32().len(), shape.iter().product::<usize>());
+                }
+            }
+        }
+    }
 }

@@ -13,6 +13,7 @@ mod networks;
 mod reference_backend;
 mod sampler;
 mod schedule;
+mod pipeline;
 mod shared;
 mod text_encoder;
 mod tokenizer;
