@@ -7,6 +7,7 @@
 
 mod args;
 mod memory;
+mod network;
 mod options;
 mod outputs;
 mod progress;

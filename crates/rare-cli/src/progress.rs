@@ -3,7 +3,7 @@
 
 use std::io::{self, IsTerminal};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -61,56 +61,55 @@ impl Progress {
 }
 
 impl Progress {
-    /// Counts passes from now on, `total` of them at most.
-    pub(crate) fn passes(&self, total: usize) -> Passes {
-        const BAR: &str = "{spinner} {msg} {wide_bar} {pos} of {len} passes, {eta} left";
-        if let Ok(style) = ProgressStyle::with_template(BAR) {
-            self.spinner.set_style(style);
-        }
-        self.spinner.set_length(total as u64);
-        self.spinner.set_position(0);
-        self.spinner.reset_eta();
-        let now = Instant::now();
-        let last_line = self.lines.then(|| Mutex::new(now));
-        Passes { bar: self.spinner.clone(), begun: now, last_line }
+    /// Where passes are counted.
+    pub(crate) fn passes(&self) -> Passes {
+        Passes { bar: self.spinner.clone(), lines: self.lines.then(Mutex::default) }
     }
 }
 
-/// Counts the passes of the networks.
+/// Counts the passes of the maps through the networks.
 pub(crate) struct Passes {
     bar: ProgressBar,
-    begun: Instant,
-    /// When the last line was written, if lines are.
-    last_line: Option<Mutex<Instant>>,
+    /// If lines are written: when counting began, and when the last line was written.
+    lines: Option<Mutex<Option<[Instant; 2]>>>,
 }
 
 impl Passes {
-    /// Some more are done.
-    pub(crate) fn done(&self, passes: usize) {
-        self.bar.inc(passes as u64);
-        let Some(last) = &self.last_line else { return };
-        let mut last = last.lock().unwrap_or_else(PoisonError::into_inner);
-        if last.elapsed() >= LINE {
-            *last = Instant::now();
-            summary::say(&self.describe());
+    /// Begins to count to `total`.
+    pub(crate) fn begin(&self, total: usize) {
+        const BAR: &str = "{spinner} {msg} {wide_bar} {pos} of {len} passes, {eta} left";
+        if let Ok(style) = ProgressStyle::with_template(BAR) {
+            self.bar.set_style(style);
+        }
+        self.bar.set_length(total as u64);
+        self.bar.set_position(0);
+        self.bar.reset_eta();
+        if let Some(lines) = &self.lines {
+            *lock(lines) = Some([Instant::now(); 2]);
         }
     }
 
-    /// Some are not needed.
-    pub(crate) fn spared(&self, passes: usize) {
-        let total = self.bar.length().unwrap_or(0);
-        self.bar.set_length(total.saturating_sub(passes as u64));
-    }
-
-    fn describe(&self) -> String {
-        let (done, total) = (self.bar.position(), self.bar.length().unwrap_or(0));
-        let left = total.saturating_sub(done) as f64 / done.max(1) as f64;
-        let left = self.begun.elapsed().as_secs_f64() * left;
-        format!("{done} of {total} passes, {} left", duration_in_words(left))
+    /// So many are done, of so many.
+    pub(crate) fn show(&self, done: usize, total: usize) {
+        self.bar.set_position(done as u64);
+        let Some(lines) = &self.lines else { return };
+        let mut lines = lock(lines);
+        let Some([begun, last]) = &mut *lines else { return };
+        if last.elapsed() >= LINE {
+            *last = Instant::now();
+            let left = total.saturating_sub(done) as f64 / done.max(1) as f64;
+            let left = duration_in_words(begun.elapsed().as_secs_f64() * left);
+            summary::say(&format!("{done} of {total} passes, {left} left"));
+        }
     }
 }
 
-/// Seconds, minutes or hours: a time that is only an estimate.
+/// What is inside, whatever happened to those who had it.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A time that is only an estimate, in seconds, minutes or hours.
 pub(crate) fn duration_in_words(seconds: f64) -> String {
     match seconds {
         ..100.0 => format!("{seconds:.0} s"),

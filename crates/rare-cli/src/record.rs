@@ -10,6 +10,7 @@ use rare::viewpoints::CameraChoice;
 use rare::{Recipe, RigidTransform};
 use serde::{Serialize, Serializer};
 
+use crate::network::NetworkRecord;
 use crate::options::{Encoder, Preset, Settings};
 use crate::run::{Inputs, Registration};
 
@@ -54,6 +55,8 @@ struct Config<'a> {
     encoder: Encoder,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth_features: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    diffusion: Option<&'a NetworkRecord>,
     threads: usize,
     recipe: &'a Recipe,
     scale: Scale,
@@ -68,6 +71,8 @@ struct Features {
     camera: CameraChoice,
     voxel: Option<f64>,
     seed: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    diffusion: Option<NetworkRecord>,
     version: &'static str,
 }
 
@@ -119,7 +124,10 @@ pub(crate) fn to_json(registration: &Registration) -> Result<String> {
 }
 
 /// The settings that made features, which are kept with them.
-pub(crate) fn features_to_json(settings: &Settings) -> Result<String> {
+pub(crate) fn features_to_json(
+    settings: &Settings,
+    network: Option<NetworkRecord>,
+) -> Result<String> {
     let features = Features {
         encoder: settings.encoder,
         preset: settings.preset,
@@ -127,6 +135,7 @@ pub(crate) fn features_to_json(settings: &Settings) -> Result<String> {
         camera: settings.refiner.camera,
         voxel: settings.refiner.voxel,
         seed: settings.refiner.seed,
+        diffusion: network,
         version: env!("CARGO_PKG_VERSION"),
     };
     Ok(serde_json::to_string_pretty(&features)? + "\n")
@@ -143,6 +152,7 @@ fn config(registration: &Registration) -> Config<'_> {
         seed: settings.refiner.seed,
         encoder: settings.encoder,
         depth_features: settings.depth_features.as_ref().map(|file| file.display().to_string()),
+        diffusion: registration.network.as_ref(),
         threads: rayon::current_num_threads(),
         recipe: &settings.refiner.recipe,
         scale,

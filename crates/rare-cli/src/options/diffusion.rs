@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use rare::hint::Percentiles;
-use rare_nets::diffusion::{DiffusionSettings, Precision, Preset};
+use rare_nets::diffusion::{DiffusionSettings, Preset};
+use rare_nets::engine::Precision;
 use serde::Deserialize;
 
 use super::choice;

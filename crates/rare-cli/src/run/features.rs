@@ -3,9 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
-use rare::{Refiner, Scan, io as files};
+use rare::io as files;
 
 use crate::args::{Clouds, FeaturesArgs};
+use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::Settings;
 use crate::progress::Progress;
 use crate::run::refine::read_initial;
@@ -54,11 +55,15 @@ fn of_pair(
 ) -> Result<String> {
     let progress = Progress::start(settings.quiet);
     progress.step("read");
+    let pipeline = OpenPipeline::of(settings)?;
     let (source, reference) = (read_scan(&clouds.source)?, read_scan(&clouds.reference)?);
-    let refiner = refiner(settings, &progress);
+    let (refiner, network) =
+        network::refiner(pipeline, [&source, &reference], settings, &progress)?;
     let views =
         refiner.encode_views(&source, &reference, initial).with_context(|| which(clouds))?;
-    let recorded = views.into_recorded(&refiner, record::features_to_json(settings)?);
+    warn(&network, settings);
+    let network = network.as_ref().map(NetworkEncoder::record);
+    let recorded = views.into_recorded(&refiner, record::features_to_json(settings, network)?);
     files::write_depth_features(output, &recorded)?;
     let maps = recorded.features();
     let layers = maps.first().map_or(0, Vec::len);
@@ -68,10 +73,11 @@ fn of_pair(
 fn of_cloud(cloud: &Path, settings: &Settings, output: &Path) -> Result<String> {
     let progress = Progress::start(settings.quiet);
     progress.step("read");
-    let scan: Scan = read_scan(cloud)?;
-    let features = refiner(settings, &progress)
-        .point_features(&scan)
-        .with_context(|| cloud.display().to_string())?;
+    let pipeline = OpenPipeline::of(settings)?;
+    let scan = read_scan(cloud)?;
+    let (refiner, network) = network::refiner(pipeline, [&scan, &scan], settings, &progress)?;
+    let features = refiner.point_features(&scan).with_context(|| cloud.display().to_string())?;
+    warn(&network, settings);
     if features.is_empty() {
         bail!(
             "{}: the cameras see nothing of this cloud: choose others with --camera",
@@ -82,6 +88,9 @@ fn of_cloud(cloud: &Path, settings: &Settings, output: &Path) -> Result<String> 
     Ok(format!("{} points with {} features each", features.len(), features.dimension()))
 }
 
-fn refiner(settings: &Settings, progress: &Progress) -> Refiner {
-    Refiner::new(settings.refiner.clone()).with_progress(progress.callback())
+fn warn(network: &Option<NetworkEncoder>, settings: &Settings) {
+    if !settings.quiet {
+        let warnings = network.iter().flat_map(NetworkEncoder::warnings);
+        warnings.for_each(|warning| summary::say(&format!("warning: {warning}")));
+    }
 }

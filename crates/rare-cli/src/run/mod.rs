@@ -17,6 +17,7 @@ use rare::{InitialMethod, Refinement, RigidTransform, Scan, io as files};
 use serde::Serialize;
 
 use crate::args::{Cli, Clouds, Command, Direction};
+use crate::network::NetworkRecord;
 use crate::options::Settings;
 use crate::outputs::{self, Output};
 use crate::{NO_POSE, SUCCESS, record, summary};
@@ -43,6 +44,8 @@ pub(crate) struct Registration {
     /// The transform that was given, source to reference.
     pub(crate) initial: Option<RigidTransform>,
     pub(crate) refinement: Refinement,
+    /// The networks that were used.
+    pub(crate) network: Option<NetworkRecord>,
     pub(crate) read_seconds: f64,
     pub(crate) total_seconds: f64,
 }

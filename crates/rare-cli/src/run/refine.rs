@@ -8,6 +8,7 @@ use rare::encode::Recorded;
 use rare::{Correspondence, Refinement, Refiner, RigidTransform, Scan, io as files};
 
 use crate::args::{Clouds, Direction, RefineArgs, Start};
+use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::Settings;
 use crate::progress::Progress;
 use crate::run::{Inputs, Registration, check_outputs, read_scan, start_threads, which};
@@ -35,7 +36,8 @@ struct Problem {
     reference: Scan,
     initial: RigidTransform,
     correspondences: Option<Vec<Correspondence>>,
-    refiner: Refiner,
+    recorded: Option<Recorded>,
+    pipeline: Option<OpenPipeline>,
 }
 
 pub(super) fn registration(
@@ -48,8 +50,15 @@ pub(super) fn registration(
     progress.step("read");
     let mut problem = read(clouds, start, &mut settings)?;
     let read_seconds = clock.elapsed().as_secs_f64();
-    problem.refiner = problem.refiner.with_progress(progress.callback());
-    let refinement = problem.solve().with_context(|| which(clouds))?;
+    let clouds_read = [&problem.source, &problem.reference];
+    let (refiner, network) =
+        network::refiner(problem.pipeline.take(), clouds_read, &settings, &progress)?;
+    let refiner = match problem.recorded.take() {
+        Some(recorded) => refiner.with_encoder(Box::new(recorded)),
+        None => refiner,
+    };
+    let mut refinement = problem.solve(&refiner).with_context(|| which(clouds))?;
+    refinement.warnings.extend(network.iter().flat_map(NetworkEncoder::warnings));
     Ok(Registration {
         settings,
         inputs: named(clouds, start),
@@ -57,6 +66,7 @@ pub(super) fn registration(
         reference: problem.reference,
         initial: Some(problem.initial),
         refinement,
+        network: network.as_ref().map(NetworkEncoder::record),
         read_seconds,
         total_seconds: clock.elapsed().as_secs_f64(),
     })
@@ -66,10 +76,7 @@ fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Probl
     // The small files first: what is wrong with them need not wait for the clouds.
     let initial = read_initial(&start.init, start.init_direction)?;
     let recorded = read_recorded(settings, &initial)?;
-    let mut refiner = Refiner::new(settings.refiner.clone());
-    if let Some(recorded) = recorded {
-        refiner = refiner.with_encoder(Box::new(recorded));
-    }
+    let pipeline = OpenPipeline::of(settings)?;
     let features = |file: &Option<PathBuf>| -> rare::Result<_> {
         file.as_ref().map(files::read_point_features).transpose()
     };
@@ -82,7 +89,8 @@ fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Probl
         reference: Scan { features: reference_features, ..read_scan(&clouds.reference)? },
         initial,
         correspondences,
-        refiner,
+        recorded,
+        pipeline,
     })
 }
 
@@ -105,11 +113,11 @@ pub(super) fn read_initial(init: &Path, direction: Direction) -> Result<RigidTra
 }
 
 impl Problem {
-    fn solve(&self) -> rare::Result<Refinement> {
+    fn solve(&self, refiner: &Refiner) -> rare::Result<Refinement> {
         let Problem { source, reference, initial, .. } = self;
         match &self.correspondences {
-            Some(pairs) => self.refiner.refine_matched(source, reference, initial, pairs),
-            None => self.refiner.refine(source, reference, initial),
+            Some(pairs) => refiner.refine_matched(source, reference, initial, pairs),
+            None => refiner.refine(source, reference, initial),
         }
     }
 }

@@ -3,9 +3,11 @@
 
 mod config;
 mod controlnet;
+mod encoder;
 mod layers;
 mod layout;
 mod noise;
+mod pipeline;
 mod sampler;
 mod schedule;
 mod settings;
@@ -13,22 +15,19 @@ mod text_encoder;
 mod tokenizer;
 mod unet;
 
+pub use crate::engine::Precision;
 pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
 pub use controlnet::{Control, ControlNet};
+pub use encoder::DiffusionEncoder;
 pub use layers::{Contexts, Timestep};
 pub use layout::{
     Differences, Layout, Misshapen, compare, controlnet_layout, text_encoder_layout, unet_layout,
 };
 pub use noise::Noise;
+pub use pipeline::{Pipeline, TokenizerFiles};
 pub use sampler::{Hints, Networks, Plan, Prediction, Sampler};
 pub use schedule::{Schedule, Step, cumulative_alphas};
-pub use settings::{
-    DiffusionSettings, INDOOR_PROMPT, NEGATIVE_PROMPT, Precision, Preset, STREET_PROMPT,
-};
+pub use settings::{DiffusionSettings, INDOOR_PROMPT, NEGATIVE_PROMPT, Preset, STREET_PROMPT};
 pub use text_encoder::TextEncoder;
 pub use tokenizer::{PROMPT_LENGTH, Tokenizer, Tokens, known_tokens};
 pub use unet::{Extent, LAYERS, Output, Unet};
-mod pipeline;
-
-pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
-pub use pipeline::{Pipeline, TokenizerFiles};

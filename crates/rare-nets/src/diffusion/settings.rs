@@ -8,6 +8,7 @@ use rare::{Error, Result};
 use serde::{Deserialize, Serialize};
 
 use super::LAYERS;
+use crate::engine::Precision;
 
 /// The prompt for rooms and objects (FreeReg's).
 pub const INDOOR_PROMPT: &str = "a photo of a room, furniture, household items, best quality";
@@ -50,17 +51,6 @@ pub struct DiffusionSettings {
     pub layers: Vec<usize>,
     /// The precision of the products.
     pub precision: Precision,
-}
-
-/// The precision of the factors of products; sums are in single precision always.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Precision {
-    /// Single precision.
-    #[default]
-    F32,
-    /// The upper half of single precision: faster where the processor multiplies it.
-    Bf16,
 }
 
 /// Settings by name.

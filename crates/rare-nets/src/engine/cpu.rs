@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use rare::{Error, Result};
+use serde::{Deserialize, Serialize};
 
 use super::arena::Arena;
 use super::attention::{self, Keys};
@@ -13,7 +14,8 @@ use super::simd::Processor;
 use super::tensor::{Elements, Tensor, Values};
 
 /// The precision of products. Sums are always in single precision.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Precision {
     /// Single precision.
     #[default]

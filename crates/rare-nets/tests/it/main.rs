@@ -10,10 +10,10 @@
 mod checkpoint;
 mod network_shapes;
 mod networks;
+mod pipeline;
 mod reference_backend;
 mod sampler;
 mod schedule;
-mod pipeline;
 mod shared;
 mod text_encoder;
 mod tokenizer;
