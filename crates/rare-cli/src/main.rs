@@ -13,6 +13,7 @@ mod outputs;
 mod progress;
 mod record;
 mod run;
+mod speed;
 mod summary;
 
 use std::process::ExitCode;

@@ -11,14 +11,16 @@ use rare::encode::DepthEncoder;
 use rare::scale::Scale;
 use rare::{DepthMap, Refiner, Scan};
 use rare_nets::cache::{CachedEncoder, WeightsIdentity};
-use rare_nets::diffusion::{DiffusionEncoder, DiffusionSettings, Pipeline, Plan};
+use rare_nets::diffusion::{
+    Cost, DiffusionEncoder, DiffusionSettings, Pipeline, Plan, latent_size,
+};
 use rare_nets::engine::CpuBackend;
 use rare_nets::weights::Choice;
 use serde::Serialize;
 
 use crate::options::{Diffusion, Settings};
-use crate::progress::{Passes, Progress};
-use crate::summary;
+use crate::progress::{Passes, Progress, duration_in_words};
+use crate::{memory, speed, summary};
 
 /// A pipeline that fits the settings, with no weight read yet.
 pub(crate) struct OpenPipeline {
@@ -33,8 +35,11 @@ struct Network {
     pipeline: Pipeline,
     settings: DiffusionSettings,
     passes: Arc<Passes>,
-    loaded: Mutex<Option<Arc<DiffusionEncoder<CpuBackend>>>>,
+    quiet: bool,
+    loaded: Mutex<Option<Loaded>>,
 }
+
+type Loaded = Arc<DiffusionEncoder<CpuBackend>>;
 
 /// The encoder of a run, and what will be said of it.
 pub(crate) struct NetworkEncoder {
@@ -110,6 +115,7 @@ impl OpenPipeline {
         let [source, reference] = clouds.map(|scan| &scan.cloud);
         let config = &settings.refiner;
         let scale = Scale::new(config.profile, config.voxel, source, reference)?;
+        let quiet = settings.quiet;
         let Diffusion { settings, cache, .. } = self.diffusion;
         let settings = settings.with_prompt_for(scale.kind);
         let record = NetworkRecord {
@@ -127,6 +133,7 @@ impl OpenPipeline {
             pipeline: self.pipeline,
             settings,
             passes: Arc::new(progress.passes()),
+            quiet,
             loaded: Mutex::default(),
         };
         let encoder =
@@ -152,12 +159,35 @@ impl NetworkEncoder {
 }
 
 impl Network {
-    fn load(&self) -> rare::Result<Arc<DiffusionEncoder<CpuBackend>>> {
+    /// Says what the maps will cost, and refuses them if there is no room.
+    fn announce(&self, maps: &[(usize, &DepthMap)], backend: &CpuBackend) -> rare::Result<()> {
+        let plan = Plan::new(&self.settings, &self.pipeline.scheduler)?;
+        let sizes = maps.iter().map(|(_, map)| latent_size(map.intrinsics()));
+        let sizes = sizes.collect::<rare::Result<Vec<_>>>()?;
+        let cost = Cost::estimate(&self.pipeline, &plan, self.settings.precision, &sizes)?;
+        cost.check_memory(memory::available())?;
+        if self.quiet {
+            return Ok(());
+        }
+        let seconds = cost.operations / speed::measured(backend)?;
+        summary::say(&format!(
+            "{} depth maps, {} passes each through networks of {:.1} GB: about {} and {:.1} GB of memory for the first round",
+            maps.len(),
+            plan.passes(),
+            cost.weight_bytes as f64 / 1e9,
+            duration_in_words(seconds),
+            cost.bytes() as f64 / 1e9
+        ));
+        Ok(())
+    }
+
+    fn load(&self, maps: &[(usize, &DepthMap)]) -> rare::Result<Loaded> {
         let mut loaded = self.loaded.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(encoder) = &*loaded {
             return Ok(Arc::clone(encoder));
         }
         let backend = CpuBackend::new(self.settings.precision)?;
+        self.announce(maps, &backend)?;
         let passes = Arc::clone(&self.passes);
         let encoder = DiffusionEncoder::load(backend, &self.pipeline, &self.settings)?
             .with_progress(move |done, total| passes.show(done, total));
@@ -167,7 +197,7 @@ impl Network {
 
 impl DepthEncoder for Network {
     fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> rare::Result<Vec<LayeredFeatures>> {
-        let encoder = self.load()?;
+        let encoder = self.load(maps)?;
         self.passes.begin(maps.len() * encoder.plan().passes());
         encoder.encode_at(maps)
     }

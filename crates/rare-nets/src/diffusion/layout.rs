@@ -257,8 +257,12 @@ mod tests {
     #[test]
     fn sizes_beyond_any_memory_do_not_overflow() {
         let mut config = stable_diffusion_1_5();
-        config.unet.block_out_channels = [usize::MAX / 2; 4];
-        assert_eq!(controlnet_layout(&config)["conv_in.bias"], [usize::MAX / 2]);
-        assert_eq!(unet_layout(&config.unet)["conv_in.bias"], [usize::MAX / 2]);
+        let most = usize::MAX;
+        config.unet.block_out_channels = [most; 4];
+        let layout = unet_layout(&config.unet);
+        assert_eq!(layout["time_embedding.linear_1.weight"], [most, most]);
+        assert_eq!(layout["up_blocks.0.resnets.0.conv1.weight"], [most, most, 3, 3]);
+        let feed_forward = "mid_block.attentions.0.transformer_blocks.0.ff.net.0.proj.bias";
+        assert_eq!(layout[feed_forward], [most]);
     }
 }

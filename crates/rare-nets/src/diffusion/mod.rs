@@ -3,6 +3,7 @@
 
 mod config;
 mod controlnet;
+mod cost;
 mod encoder;
 mod layers;
 mod layout;
@@ -18,6 +19,10 @@ mod unet;
 pub use crate::engine::Precision;
 pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
 pub use controlnet::{Control, ControlNet};
+pub use cost::{
+    Cost, LatentSize, available_memory, controlnet_operations, hint_operations, latent_size,
+    unet_operations,
+};
 pub use encoder::DiffusionEncoder;
 pub use layers::{Contexts, Timestep};
 pub use layout::{

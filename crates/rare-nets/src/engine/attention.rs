@@ -288,16 +288,13 @@ impl<T: Element> Vectorized for QueryBlock<'_, T> {
         let mut running = Running { largest: [UNSEEN; QUERIES], sum: [0.0; QUERIES], values };
         for first_key in (0..packed.padded).step_by(KEYS) {
             let keys = KEYS.min(packed.padded - first_key);
-            self.score(simd, queries, first_key, keys, scores);
+            self.score(queries, first_key, keys, scores);
             self.exponentiate(simd, first_key, keys, scores, halves, &mut running);
-            match context.precision {
-                Precision::F32 => {
-                    self.weigh::<S, false>(simd, first_key, keys, scores, &mut running)
-                }
-                Precision::Bf16 => {
-                    self.weigh::<S, true>(simd, first_key, keys, halves, &mut running)
-                }
-            }
+            let weights = match context.precision {
+                Precision::F32 => &*scores,
+                Precision::Bf16 => &*halves,
+            };
+            self.weigh(first_key, keys, weights, &mut running);
         }
         self.write(simd, &running);
     }
@@ -329,15 +326,7 @@ impl<T: Element> QueryBlock<'_, T> {
     }
 
     /// Products of all queries with some keys.
-    #[inline(always)]
-    fn score<S: Simd>(
-        &self,
-        simd: S,
-        queries: &[f32],
-        first_key: usize,
-        keys: usize,
-        scores: &mut [f32],
-    ) {
+    fn score(&self, queries: &[f32], first_key: usize, keys: usize, scores: &mut [f32]) {
         let Attention { context, packed, heads, .. } = self.attention;
         let part = self.source() * heads + self.head;
         let start = part * packed.key_length + first_key * packed.units;
@@ -355,10 +344,7 @@ impl<T: Element> QueryBlock<'_, T> {
                 groups: PANEL / LANES,
                 accumulate: false,
             };
-            match context.precision {
-                Precision::F32 => tile.multiply::<S, false>(simd, &mut scores[panel * PANEL..]),
-                Precision::Bf16 => tile.multiply::<S, true>(simd, &mut scores[panel * PANEL..]),
-            }
+            tile.multiply(context.processor, context.precision, &mut scores[panel * PANEL..]);
         }
     }
 
@@ -411,15 +397,7 @@ impl<T: Element> QueryBlock<'_, T> {
     }
 
     /// Adds the values of some keys, weighted.
-    #[inline(always)]
-    fn weigh<S: Simd, const PAIRS: bool>(
-        &self,
-        simd: S,
-        first_key: usize,
-        keys: usize,
-        weights: &[f32],
-        running: &mut Running<'_>,
-    ) {
+    fn weigh(&self, first_key: usize, keys: usize, weights: &[f32], running: &mut Running<'_>) {
         let Attention { context, packed, heads, .. } = self.attention;
         let (before, steps) = (context.precision.units(first_key), context.precision.units(keys));
         let start = (self.source() * heads + self.head) * packed.value_length;
@@ -434,7 +412,7 @@ impl<T: Element> QueryBlock<'_, T> {
             groups: packed.width / LANES,
             accumulate: true,
         };
-        tile.multiply::<S, PAIRS>(simd, running.values);
+        tile.multiply(context.processor, context.precision, running.values);
     }
 
     /// Divides by the sums.

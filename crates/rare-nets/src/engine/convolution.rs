@@ -225,10 +225,8 @@ impl<T: Element> Vectorized for Chunk<'_, T> {
                 groups: PANEL / LANES,
                 accumulate: block.steps.start > 0,
             };
-            match self.product.context.precision {
-                Precision::F32 => tile.multiply::<S, false>(simd, sums),
-                Precision::Bf16 => tile.multiply::<S, true>(simd, sums),
-            }
+            let Context { processor, precision, .. } = self.product.context;
+            tile.multiply(processor, precision, sums);
         }
         for (row, sums) in sums.chunks_exact(PANEL).take(self.rows.len()).enumerate() {
             self.epilogue.apply(simd, self.first + row, self.panel, sums, self.output);

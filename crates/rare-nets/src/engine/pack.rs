@@ -69,12 +69,6 @@ impl PackedWeight {
         self.side * self.side
     }
 
-    /// Memory of the weights.
-    #[cfg(test)]
-    pub(super) fn bytes(&self) -> usize {
-        self.panels * self.taps() * self.steps() * PANEL * self.storage.bytes()
-    }
-
     /// The columns of one panel for some steps (counted over all taps), widened into `scratch` if they are stored
     /// narrower.
     pub(super) fn block<'a, S: Simd>(

@@ -4,6 +4,7 @@
 //! AVX-512, two with AVX2, four with NEON. So sums are split in the same way everywhere. A type that implements it is
 //! a token: it only exists where the processor has the instructions, which is why its methods are safe to call.
 //! [`Processor::run`] compiles a kernel for each token with the matching instructions switched on.
+#![allow(unsafe_code)]
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
@@ -17,6 +18,8 @@ use half::{bf16, f16};
 use rare::{Error, Result};
 
 use portable::Portable;
+
+use super::tile::Tile;
 
 /// Elements of a vector.
 pub(super) const LANES: usize = 16;
@@ -34,6 +37,18 @@ pub(super) trait Simd: Copy + Send + Sync {
 
     /// The most rows of a register tile with this many groups of columns.
     fn tile_rows(groups: usize) -> usize;
+
+    /// Computes a register tile: at most [`Simd::tile_rows`] rows, `groups` groups of columns.
+    ///
+    /// # Safety
+    /// As [`Tile::registers`].
+    unsafe fn multiply_tile<const PAIRS: bool>(
+        self,
+        tile: &Tile<'_>,
+        groups: usize,
+        b: *const f32,
+        c: *mut f32,
+    );
 
     fn splat(self, value: f32) -> Self::Floats;
     fn load(self, values: &[f32; LANES]) -> Self::Floats;

@@ -1,7 +1,22 @@
 //! The matrix product's innermost loop: a tile of rows times a few groups of columns, held in registers.
 #![allow(unsafe_code)]
 
-use super::simd::{LANES, Simd};
+use super::cpu::Precision;
+use super::simd::{LANES, Processor, Simd, Vectorized};
+
+/// Calls the register tile that is compiled for this many rows and groups of columns.
+macro_rules! choose_tile {
+    ($simd:expr, $tile:expr, $groups:expr, $b:expr, $c:expr, $($count:literal: $($rows:literal)*),*) => {
+        match ($groups, $tile.rows.len()) {
+            $($(($count, $rows) => unsafe {
+                // SAFETY: what the caller vouches for.
+                $tile.registers::<Self, PAIRS, $rows, $count>($simd, $b, $c);
+            },)*)*
+            (groups, rows) => debug_assert!(false, "no tile of {rows} rows and {groups} groups"),
+        }
+    };
+}
+pub(super) use choose_tile;
 
 /// A product of rows of `a` with a panel of `b`, added to or stored in `c`. Elements of `a` and `b` are units of 32 bits:
 /// a number, or a pair of bf16.
@@ -37,6 +52,26 @@ pub(super) struct Segment {
     pub(super) steps: u32,
 }
 
+/// A product that fits; with `PAIRS`, units are pairs of bf16.
+struct Multiplication<'a, const PAIRS: bool> {
+    tile: &'a Tile<'a>,
+    c: &'a mut [f32],
+}
+
+impl<const PAIRS: bool> Vectorized for Multiplication<'_, PAIRS> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let mut group = 0;
+        while group < self.tile.groups {
+            let groups = (self.tile.groups - group).min(S::GROUPS);
+            self.tile.columns::<S, PAIRS>(simd, self.c, group, groups);
+            group += groups;
+        }
+    }
+}
+
 impl Tile<'_> {
     /// Whether everything that will be read and written exists.
     fn fits(&self, c: &[f32]) -> bool {
@@ -50,20 +85,18 @@ impl Tile<'_> {
             && needed(self.rows.len(), self.c_stride) <= c.len()
     }
 
-    /// Computes the product of any number of rows and groups. With `PAIRS`, units are pairs of bf16.
+    /// Computes the product of any number of rows and groups, in the precision of the units.
     ///
     /// Operands that do not fit are a defect of the caller: then nothing is computed (and debug builds stop).
-    #[inline(always)]
-    pub(super) fn multiply<S: Simd, const PAIRS: bool>(&self, simd: S, c: &mut [f32]) {
+    pub(super) fn multiply(&self, processor: Processor, precision: Precision, c: &mut [f32]) {
         debug_assert!(self.fits(c));
         if !self.fits(c) {
             return;
         }
-        let mut group = 0;
-        while group < self.groups {
-            let groups = (self.groups - group).min(S::GROUPS);
-            self.columns::<S, PAIRS>(simd, c, group, groups);
-            group += groups;
+        // A kernel of its own, so that its many register tiles are compiled once for each processor.
+        match precision {
+            Precision::F32 => processor.run(Multiplication::<false> { tile: self, c }),
+            Precision::Bf16 => processor.run(Multiplication::<true> { tile: self, c }),
         }
     }
 
@@ -84,36 +117,8 @@ impl Tile<'_> {
             let b = self.b[group * LANES..].as_ptr();
             let c = c[first * self.c_stride + group * LANES..].as_mut_ptr();
             // SAFETY: `fits` holds for the whole, and this is a part of it.
-            unsafe { part.rows_of::<S, PAIRS>(simd, groups, b, c) };
+            unsafe { simd.multiply_tile::<PAIRS>(&part, groups, b, c) };
         }
-    }
-
-    /// Chooses the tile that is compiled for this many rows and groups.
-    ///
-    /// # Safety
-    /// As [`Tile::registers`].
-    #[inline(always)]
-    unsafe fn rows_of<S: Simd, const PAIRS: bool>(
-        &self,
-        simd: S,
-        groups: usize,
-        b: *const f32,
-        c: *mut f32,
-    ) {
-        macro_rules! choose {
-            ($($rows:literal)*) => {
-                match (self.rows.len(), groups) {
-                    $(
-                        ($rows, 1) => unsafe { self.registers::<S, PAIRS, $rows, 1>(simd, b, c) },
-                        ($rows, 2) if S::GROUPS >= 2 => unsafe { self.registers::<S, PAIRS, $rows, 2>(simd, b, c) },
-                        ($rows, 3) if S::GROUPS >= 3 && $rows <= 9 => unsafe { self.registers::<S, PAIRS, $rows, 3>(simd, b, c) },
-                    )*
-                    _ => debug_assert!(false, "no tile of {} rows", self.rows.len()),
-                }
-            };
-        }
-        // SAFETY (of every call): what the caller vouches for.
-        choose!(1 2 3 4 5 6 7 8 9 10 11 12 13 14)
     }
 
     /// The loop itself: `ROWS * GROUPS` sums in registers.
@@ -122,7 +127,12 @@ impl Tile<'_> {
     /// There are `ROWS` rows; `b` has `GROUPS * LANES` columns of all steps, `c` of all rows, and `a` all segments of
     /// all rows.
     #[inline(always)]
-    unsafe fn registers<S: Simd, const PAIRS: bool, const ROWS: usize, const GROUPS: usize>(
+    pub(super) unsafe fn registers<
+        S: Simd,
+        const PAIRS: bool,
+        const ROWS: usize,
+        const GROUPS: usize,
+    >(
         &self,
         simd: S,
         b: *const f32,

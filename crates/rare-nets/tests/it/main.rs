@@ -8,6 +8,7 @@
 )]
 
 mod checkpoint;
+mod encoder;
 mod network_shapes;
 mod networks;
 mod pipeline;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Write;
 use std::path::Path;
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rare::Result;
@@ -13,7 +14,7 @@ use rare_nets::diffusion::{
     Control, ControlNet, ControlNetConfig, Differences, Extent, LAYERS, Layout, Misshapen, Unet,
     UnetConfig, compare, controlnet_layout, unet_layout,
 };
-use rare_nets::engine::{Arrangement, Backend, Convolution, Kernel, Shape};
+use rare_nets::engine::{Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
 use serde_json::{Value, json};
 
 use crate::shared;
@@ -37,6 +38,8 @@ fn config() -> ControlNetConfig {
 struct ShapeBackend {
     packed: AtomicUsize,
     convolved: AtomicUsize,
+    /// How often each kind of normalisation ran, by its name and epsilon.
+    normalized: Mutex<BTreeMap<String, usize>>,
 }
 
 /// Inputs and outputs of a kernel.
@@ -78,6 +81,9 @@ impl Backend for ShapeBackend {
     ) -> Result<Shape> {
         self.convolved.fetch_add(1, Ordering::Relaxed);
         assert_eq!(input.channels, weight.inputs);
+        if let Some(name) = normalization(&fused.prologue) {
+            *self.normalized.lock().unwrap().entry(name).or_default() += 1;
+        }
         let size =
             |length: usize| (length * if fused.upsample { 2 } else { 1 }).div_ceil(fused.stride);
         let (height, width) = (size(input.height), size(input.width));
@@ -102,6 +108,16 @@ impl Backend for ShapeBackend {
         let joint = Shape { channels: first.channels + second.channels, ..*first };
         assert_eq!(joint, Shape { channels: joint.channels, ..*second });
         Ok(joint)
+    }
+}
+
+fn normalization(prologue: &Prologue<'_>) -> Option<String> {
+    match prologue {
+        Prologue::None | Prologue::Silu => None,
+        Prologue::GroupNormalization { groups, epsilon, silu, .. } => {
+            Some(format!("{groups} groups, {epsilon:e}, silu {silu}"))
+        }
+        Prologue::LayerNormalization { epsilon, .. } => Some(format!("layer, {epsilon:e}")),
     }
 }
 
@@ -190,6 +206,19 @@ fn layers_and_residuals_have_the_published_shapes() {
         check(&output.layers, &golden[name]["layers"]);
         check(&control().residuals(&backend).unwrap(), &golden[name]["control_residuals"]);
     }
+}
+
+#[test]
+fn normalizations_have_the_published_epsilons() {
+    // They are too small to show in the recordings.
+    let backend = ShapeBackend::default();
+    let unet = load_unet(&backend, Extent::Whole);
+    run_unet(&backend, &unet, latents(1, 8, 8), None, Extent::Whole).unwrap();
+    let normalized = backend.normalized.into_inner().unwrap();
+    let (residual, transformer) = ("32 groups, 1e-5, silu true", "32 groups, 1e-6, silu false");
+    let expected = [(residual, 2 * 22 + 1), (transformer, 16), ("layer, 1e-5", 3 * 16)];
+    let expected = expected.map(|(name, count)| (name.to_owned(), count));
+    assert_eq!(normalized, BTreeMap::from(expected));
 }
 
 #[test]

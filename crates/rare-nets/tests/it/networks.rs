@@ -2,7 +2,7 @@
 
 use rare_nets::checkpoint::Parameters;
 use rare_nets::diffusion::{Control, ControlNet, ControlNetConfig, Extent, Unet, UnetConfig};
-use rare_nets::engine::{Backend, Shape};
+use rare_nets::engine::{Backend, CpuBackend, Precision, Processor, Shape};
 
 use crate::reference_backend::{ReferenceBackend, Tensor};
 use crate::shared::{self, Array, Golden, relative_difference};
@@ -326,4 +326,26 @@ fn distance(result: &Tensor, states: &[f64]) -> f64 {
         return f64::INFINITY;
     }
     relative_difference(&result.values, states)
+}
+
+fn on_every_processor(test: impl Fn(CpuBackend)) {
+    for processor in Processor::available() {
+        test(CpuBackend::on(processor, Precision::F32));
+    }
+}
+
+#[test]
+fn every_processor_follows_the_recording() {
+    on_every_processor(|cpu| follows_the_recording(cpu, "16x24"));
+    follows_the_recording(CpuBackend::new(Precision::F32).unwrap(), "64x88");
+}
+
+#[test]
+fn a_batch_gives_the_recorded_noise_on_every_processor() {
+    on_every_processor(a_batch_gives_the_recorded_noise);
+}
+
+#[test]
+fn part_of_the_network_gives_the_recorded_layers_on_every_processor() {
+    on_every_processor(part_of_the_network_gives_the_recorded_layers);
 }

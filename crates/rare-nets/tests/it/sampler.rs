@@ -7,7 +7,7 @@ use rare_nets::diffusion::{
     ControlNet, ControlNetConfig, DiffusionSettings, Hints, Networks, Plan, Prediction, Preset,
     Sampler, Schedule, SchedulerConfig, Unet, UnetConfig,
 };
-use rare_nets::engine::{Backend, Shape};
+use rare_nets::engine::{Backend, CpuBackend, Precision, Shape};
 
 use crate::reference_backend::ReferenceBackend;
 use crate::shared::{self, Array, Golden, relative_difference};
@@ -162,9 +162,10 @@ fn check_features(recording: &mut Recording, features: &[Vec<rare::FeatureMap>],
 }
 
 /// The seventeen steps one after the other, and the features at their end.
-fn all_steps_together_follow_the_recording<B: Backend>(backend: B) {
+#[test]
+fn all_steps_together_follow_the_recording() {
     let Some(mut recording) = Recording::open() else { return };
-    let sampler = sampler(backend, plan(), &mut recording);
+    let sampler = sampler(cpu(), plan(), &mut recording);
     let hints = hints(&sampler, &mut recording);
     let mut noise = vec![recording.f32("x_T", None)];
     noise.extend((0..17).map(|index| recording.f32("noise", Some(index))));
@@ -180,9 +181,10 @@ fn all_steps_together_follow_the_recording<B: Backend>(backend: B) {
 }
 
 /// All twenty steps, of which the features need seventeen.
-fn the_last_image_is_the_recorded_one<B: Backend>(backend: B) {
+#[test]
+fn the_last_image_is_the_recorded_one() {
     let Some(mut recording) = Recording::open() else { return };
-    let sampler = sampler(backend, plan(), &mut recording);
+    let sampler = sampler(cpu(), plan(), &mut recording);
     let hints = hints(&sampler, &mut recording);
     let mut latents = recording.f32("x_T", None);
     for (index, step) in Schedule::new(&scheduler(), 20).unwrap().steps.iter().enumerate() {
@@ -199,12 +201,12 @@ fn predictions_and_features_follow_the_recording_on_the_reference_backend() {
     predictions_and_features_follow_the_recording(ReferenceBackend::default());
 }
 
-#[test]
-fn all_steps_together_follow_the_recording_on_the_reference_backend() {
-    all_steps_together_follow_the_recording(ReferenceBackend::default());
+/// In single precision.
+fn cpu() -> CpuBackend {
+    CpuBackend::new(Precision::F32).unwrap()
 }
 
 #[test]
-fn the_last_image_is_the_recorded_one_on_the_reference_backend() {
-    the_last_image_is_the_recorded_one(ReferenceBackend::default());
+fn predictions_and_features_follow_the_recording_on_the_processor() {
+    predictions_and_features_follow_the_recording(cpu());
 }

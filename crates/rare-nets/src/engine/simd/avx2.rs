@@ -13,6 +13,7 @@ use core::arch::x86_64::{
 
 use half::{bf16, f16};
 
+use super::super::tile::{Tile, choose_tile};
 use super::{LANES, Simd, Vectorized};
 
 /// Exists where the processor has AVX2, FMA and F16C.
@@ -76,6 +77,17 @@ impl Simd for Avx2 {
 
     fn tile_rows(_groups: usize) -> usize {
         6
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_tile<const PAIRS: bool>(
+        self,
+        tile: &Tile<'_>,
+        groups: usize,
+        b: *const f32,
+        c: *mut f32,
+    ) {
+        choose_tile!(self, tile, groups, b, c, 1: 1 2 3 4 5 6);
     }
 
     #[inline(always)]

@@ -14,11 +14,12 @@ use core::mem::transmute;
 
 use half::{bf16, f16};
 
+use super::super::tile::{Tile, choose_tile};
 use super::{LANES, Simd, Vectorized};
 
-/// Exists where the processor has AVX-512 F, BW, DQ and VL; with `PAIRS`, BF16 as well.
+/// Exists where the processor has AVX-512 F, BW, DQ and VL; with `BF16`, that as well.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Avx512<const PAIRS: bool>(());
+pub(super) struct Avx512<const BF16: bool>(());
 
 impl Avx512<false> {
     pub(super) fn detect() -> Option<Avx512<false>> {
@@ -70,7 +71,7 @@ fn pairs(bits: __m512) -> (__m512, __m512) {
 
 // SAFETY of every block below: `self` exists, so the processor has the instructions; loads and stores go through
 // references to sixteen elements.
-impl<const PAIRS: bool> Simd for Avx512<PAIRS> {
+impl<const BF16: bool> Simd for Avx512<BF16> {
     type Floats = __m512;
 
     const GROUPS: usize = 3;
@@ -78,9 +79,21 @@ impl<const PAIRS: bool> Simd for Avx512<PAIRS> {
     fn tile_rows(groups: usize) -> usize {
         // 32 registers, less one per group of columns and one for what is multiplied with them.
         match groups {
-            1 | 2 => 14,
+            1 => 6,
+            2 => 14,
             _ => 9,
         }
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_tile<const PAIRS: bool>(
+        self,
+        tile: &Tile<'_>,
+        groups: usize,
+        b: *const f32,
+        c: *mut f32,
+    ) {
+        choose_tile!(self, tile, groups, b, c, 1: 1 2 3 4 5 6, 2: 1 2 3 4 5 6 7 8 9 10 11 12 13 14, 3: 1 2 3 4 5 6 7 8 9);
     }
 
     #[inline(always)]
@@ -120,7 +133,7 @@ impl<const PAIRS: bool> Simd for Avx512<PAIRS> {
     fn store_bf16(self, floats: __m512, values: &mut [bf16; LANES]) {
         // SAFETY: see the implementation's comment.
         unsafe {
-            let halves = if PAIRS {
+            let halves = if BF16 {
                 transmute::<_, core::arch::x86_64::__m256i>(_mm512_cvtneps_pbh(floats))
             } else {
                 let bits = _mm512_castps_si512(floats);
@@ -176,9 +189,9 @@ impl<const PAIRS: bool> Simd for Avx512<PAIRS> {
 
     #[inline(always)]
     fn dot_pairs(self, a: __m512, b: __m512, sum: __m512) -> __m512 {
-        // SAFETY: see the implementation's comment; with `PAIRS` the token vouches for BF16 too.
+        // SAFETY: see the implementation's comment; with `BF16` the token vouches for BF16 too.
         unsafe {
-            if PAIRS {
+            if BF16 {
                 return _mm512_dpbf16_ps(sum, transmute(a), transmute(b));
             }
             let ((a_high, a_low), (b_high, b_low)) = (pairs(a), pairs(b));

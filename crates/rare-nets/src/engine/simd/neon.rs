@@ -11,6 +11,7 @@ use core::arch::aarch64::{
 
 use half::{bf16, f16};
 
+use super::super::tile::{Tile, choose_tile};
 use super::{LANES, Simd, Vectorized};
 
 /// Exists where the processor has NEON.
@@ -61,6 +62,17 @@ impl Simd for Neon {
 
     fn tile_rows(_groups: usize) -> usize {
         6
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_tile<const PAIRS: bool>(
+        self,
+        tile: &Tile<'_>,
+        groups: usize,
+        b: *const f32,
+        c: *mut f32,
+    ) {
+        choose_tile!(self, tile, groups, b, c, 1: 1 2 3 4 5 6);
     }
 
     #[inline(always)]

@@ -1,7 +1,9 @@
 //! Plain Rust, for processors without anything better and as the reference of the others.
+#![allow(unsafe_code)]
 
 use half::{bf16, f16};
 
+use super::super::tile::{Tile, choose_tile};
 use super::{LANES, Simd};
 
 /// Exists everywhere.
@@ -46,6 +48,17 @@ impl Simd for Portable {
 
     fn tile_rows(_groups: usize) -> usize {
         2
+    }
+
+    #[inline(always)]
+    unsafe fn multiply_tile<const PAIRS: bool>(
+        self,
+        tile: &Tile<'_>,
+        groups: usize,
+        b: *const f32,
+        c: *mut f32,
+    ) {
+        choose_tile!(self, tile, groups, b, c, 1: 1 2);
     }
 
     #[inline(always)]
