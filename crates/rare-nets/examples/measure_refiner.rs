@@ -1,8 +1,10 @@
 //! Refines every labelled pair of a benchmark folder in one process and prints one line per pair, for development:
-//! evidence beside the truth. With `diffusion=PRESET weights=DIR` the features of depth maps are those of Stable
-//! Diffusion, so this is the program that measures what real weights are worth.
+//! evidence beside the truth.
 //!
 //! `cargo run --release --example measure_refiner -- FOLDER PAIRS.json INIT.json [paper] [-v] [key=value ...]`
+//!
+//! With `diffusion=PRESET weights=DIR` and perhaps `cache=DIR` the features of depth maps are those of Stable Diffusion,
+//! so this is the program that measures what trained weights are worth.
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "a measuring program")]
 
 use std::collections::BTreeMap;
@@ -10,8 +12,13 @@ use std::path::Path;
 use std::time::Instant;
 
 use rare::data::PoseError;
+use rare::encode::DepthEncoder;
 use rare::nalgebra::Matrix4;
+use rare::scale::SceneKind;
 use rare::{Correspondence, Recipe, Refinement, Refiner, RefinerConfig, RigidTransform, Scan};
+use rare_nets::cache::{CachedEncoder, WeightsIdentity};
+use rare_nets::diffusion::{DiffusionEncoder, Pipeline, Preset};
+use rare_nets::engine::CpuBackend;
 use serde_json::Value;
 
 /// Settings that are not the refiner's.
@@ -73,6 +80,25 @@ fn refiner(arguments: &[String]) -> Refiner {
     config.recipe = config.recipe.for_network();
     let encoder = encoder(arguments, preset);
     Refiner::new(config).with_encoder(encoder)
+}
+
+/// Loaded once for all pairs; features that come back are taken from the cache.
+fn encoder(arguments: &[String], preset: &str) -> Box<dyn DepthEncoder> {
+    let weights = setting(arguments, "weights").unwrap_or("weights");
+    let pipeline = Pipeline::open(Path::new(weights)).unwrap();
+    if let Some(remark) = &pipeline.remark {
+        println!("warning: {remark}");
+    }
+    let settings = preset.parse::<Preset>().unwrap().settings();
+    let lidar = arguments[0].contains("lidar");
+    let kind = if lidar { SceneKind::Lidar } else { SceneKind::Indoor };
+    let settings = settings.with_prompt_for(kind);
+    let identity = WeightsIdentity::of(&pipeline.files).unwrap().on_this_machine;
+    let identity = format!("{identity} {}", serde_json::to_string(&settings).unwrap());
+    let backend = CpuBackend::new(settings.precision).unwrap();
+    let encoder = DiffusionEncoder::load(backend, &pipeline, &settings).unwrap();
+    let cache = setting(arguments, "cache").map(Path::new);
+    Box::new(CachedEncoder::new(encoder, &identity, cache).unwrap())
 }
 
 fn config(arguments: &[String]) -> RefinerConfig {
