@@ -171,7 +171,7 @@ impl Network {
         }
         let seconds = cost.operations / speed::measured(backend)?;
         summary::say(&format!(
-            "{} depth maps, {} passes each through networks of {:.1} GB: about {} and {:.1} GB of memory for the first round",
+            "{} depth maps, passes through the networks for each: {}; weights {:.1} GB; the first round takes about {} and {:.1} GB of memory",
             maps.len(),
             plan.passes(),
             cost.weight_bytes as f64 / 1e9,
