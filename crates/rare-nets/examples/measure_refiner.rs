@@ -71,7 +71,7 @@ fn transform(value: &Value) -> RigidTransform {
 /// `key=value` among the arguments.
 fn setting<'a>(arguments: &'a [String], key: &str) -> Option<&'a str> {
     let pairs = arguments.iter().filter_map(|argument| argument.split_once('='));
-    pairs.filter(|(name, _)| *name == key).map(|(_, value)| value).last()
+    pairs.filter(|(name, _)| *name == key).map(|(_, value)| value).next_back()
 }
 
 fn refiner(arguments: &[String]) -> Refiner {
