@@ -1,8 +1,10 @@
 //! The program as its users see it: files in, files, exit codes and messages out.
-#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
+#![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking")]
 
 mod bad_input;
 mod commands;
+mod diffusion;
+mod features;
 mod options;
 mod outputs;
 mod readme;

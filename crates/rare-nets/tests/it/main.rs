@@ -18,3 +18,7 @@ mod schedule;
 mod shared;
 mod text_encoder;
 mod tokenizer;
+#[cfg(feature = "fetch")]
+mod weights;
+#[cfg(feature = "fetch")]
+mod weights_server;
