@@ -2,5 +2,7 @@
 //! Extraction").
 
 mod config;
+mod pipeline;
 
 pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
+pub use pipeline::{Pipeline, TokenizerFiles};

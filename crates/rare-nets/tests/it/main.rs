@@ -5,3 +5,7 @@
 mod weights;
 #[cfg(feature = "fetch")]
 mod weights_server;
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout)]
+
+mod checkpoint;
+mod shared;

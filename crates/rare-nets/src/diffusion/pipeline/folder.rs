@@ -1,0 +1,82 @@
+//! The layout of the diffusers library: a folder per part, with `config.json` and weights.
+
+use std::path::{Path, PathBuf};
+
+use rare::{Error, Result};
+
+use super::files::{self, Json, Names};
+use super::places::Places;
+use super::{Network, TokenizerFiles, versions};
+use crate::checkpoint::Parameters;
+use crate::diffusion::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
+
+/// Folders in which a `ControlNet` may be; the empty name is a repository of a `ControlNet` itself.
+const CONTROLNET_FOLDERS: [&str; 4] =
+    ["controlnet", "control_v11f1p_sd15_depth", "sd-controlnet-depth", ""];
+
+/// The U-Net; `None` if there is no folder `unet`.
+pub(super) fn unet(places: &Places) -> Result<Option<Network<UnetConfig>>> {
+    let Some(folder) = places.folder("unet") else { return Ok(None) };
+    network(&folder, &files::DIFFUSION_MODEL, versions::unet).map(Some)
+}
+
+/// The text encoder.
+pub(super) fn text_encoder(places: &Places) -> Result<Network<TextConfig>> {
+    let Some(folder) = places.folder("text_encoder") else {
+        return Err(places.missing("text encoder", "text_encoder/"));
+    };
+    network(&folder, &files::TEXT_MODEL, versions::text_encoder)
+}
+
+/// The `ControlNet`; `None` if there is none in this layout.
+pub(super) fn controlnet(places: &Places) -> Result<Option<Network<ControlNetConfig>>> {
+    for name in CONTROLNET_FOLDERS {
+        for folder in &places.folders {
+            let folder = if name.is_empty() { folder.clone() } else { folder.join(name) };
+            if folder.join("config.json").is_file() {
+                return network(&folder, &files::DIFFUSION_MODEL, versions::controlnet).map(Some);
+            }
+        }
+    }
+    Ok(None)
+}
+
+/// The noise schedule, and the file that says it.
+pub(super) fn scheduler(places: &Places) -> Result<(SchedulerConfig, Option<PathBuf>)> {
+    const NAME: &str = "scheduler/scheduler_config.json";
+    let Some(path) = places.file(NAME) else { return Err(places.missing("noise schedule", NAME)) };
+    let json = Json::read(path)?;
+    Ok((versions::scheduler(&json)?, Some(json.path)))
+}
+
+/// The files of the tokenizer, in their folder or beside everything else.
+pub(super) fn tokenizer(places: &Places) -> Result<TokenizerFiles> {
+    let file = |name: &str| {
+        places.file(&format!("tokenizer/{name}")).or_else(|| places.file(name)).ok_or_else(|| {
+            let looked_for = format!(
+                "tokenizer/{name} and {name}; a single weight file does not contain it: take it from the folder tokenizer of the repository of Stable Diffusion 1.5"
+            );
+            places.missing("tokenizer", &looked_for)
+        })
+    };
+    Ok(TokenizerFiles { vocabulary: file("vocab.json")?, merges: file("merges.txt")? })
+}
+
+/// One network of a folder.
+fn network<C>(
+    folder: &Path,
+    names: &Names,
+    read_config: fn(&Json) -> Result<C>,
+) -> Result<Network<C>> {
+    let config_file = folder.join("config.json");
+    if !config_file.is_file() {
+        let what =
+            "there is no config.json beside the weights: take the whole folder of the repository";
+        return Err(Error::in_file(folder, what));
+    }
+    let json = Json::read(config_file)?;
+    let config = read_config(&json)?;
+    let weights = files::weights(folder, names)?;
+    let parameters = Parameters::open(&weights)?;
+    Ok(Network { parameters, config, config_file: Some(json.path) })
+}
