@@ -1,20 +1,28 @@
-//! A sign of life on a terminal while something takes long.
+//! A sign of life while something takes long: on a terminal a spinner, or a bar where passes can be counted; elsewhere a
+//! line now and then, where it takes minutes.
 
 use std::io::{self, IsTerminal};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
+use std::sync::{Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressDrawTarget};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use crate::summary;
 
 /// Work that takes less shows nothing.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// How often the spinner turns.
 const TURN: Duration = Duration::from_millis(100);
+/// How often a line is written where there is no terminal.
+const LINE: Duration = Duration::from_secs(15);
 
 /// Names the current step beside a spinner until it is dropped.
 pub(crate) struct Progress {
     spinner: ProgressBar,
+    /// Whether lines are written, as there is somebody to read them and no terminal.
+    lines: bool,
     /// Waits for [`PATIENCE`] to pass or the sender to be dropped, whichever is first.
     waiting: Option<(Sender<()>, JoinHandle<()>)>,
 }
@@ -24,7 +32,8 @@ impl Progress {
     pub(crate) fn start(quiet: bool) -> Progress {
         let spinner = ProgressBar::new_spinner();
         spinner.set_draw_target(ProgressDrawTarget::hidden());
-        let shown = !quiet && io::stderr().is_terminal();
+        let terminal = io::stderr().is_terminal();
+        let shown = !quiet && terminal;
         let waiting = shown.then(|| {
             let (sender, receiver) = mpsc::channel();
             let spinner = spinner.clone();
@@ -36,7 +45,7 @@ impl Progress {
             });
             (sender, thread)
         });
-        Progress { spinner, waiting }
+        Progress { spinner, lines: !quiet && !terminal, waiting }
     }
 
     /// Says what is being done.
@@ -48,6 +57,65 @@ impl Progress {
     pub(crate) fn callback(&self) -> impl Fn(&'static str) + Send + Sync + 'static {
         let spinner = self.spinner.clone();
         move |step| spinner.set_message(step)
+    }
+}
+
+impl Progress {
+    /// Counts passes from now on, `total` of them at most.
+    pub(crate) fn passes(&self, total: usize) -> Passes {
+        const BAR: &str = "{spinner} {msg} {wide_bar} {pos} of {len} passes, {eta} left";
+        if let Ok(style) = ProgressStyle::with_template(BAR) {
+            self.spinner.set_style(style);
+        }
+        self.spinner.set_length(total as u64);
+        self.spinner.set_position(0);
+        self.spinner.reset_eta();
+        let now = Instant::now();
+        let last_line = self.lines.then(|| Mutex::new(now));
+        Passes { bar: self.spinner.clone(), begun: now, last_line }
+    }
+}
+
+/// Counts the passes of the networks.
+pub(crate) struct Passes {
+    bar: ProgressBar,
+    begun: Instant,
+    /// When the last line was written, if lines are.
+    last_line: Option<Mutex<Instant>>,
+}
+
+impl Passes {
+    /// Some more are done.
+    pub(crate) fn done(&self, passes: usize) {
+        self.bar.inc(passes as u64);
+        let Some(last) = &self.last_line else { return };
+        let mut last = last.lock().unwrap_or_else(PoisonError::into_inner);
+        if last.elapsed() >= LINE {
+            *last = Instant::now();
+            summary::say(&self.describe());
+        }
+    }
+
+    /// Some are not needed.
+    pub(crate) fn spared(&self, passes: usize) {
+        let total = self.bar.length().unwrap_or(0);
+        self.bar.set_length(total.saturating_sub(passes as u64));
+    }
+
+    fn describe(&self) -> String {
+        let (done, total) = (self.bar.position(), self.bar.length().unwrap_or(0));
+        let left = total.saturating_sub(done) as f64 / done.max(1) as f64;
+        let left = self.begun.elapsed().as_secs_f64() * left;
+        format!("{done} of {total} passes, {} left", duration_in_words(left))
+    }
+}
+
+/// Seconds, minutes or hours: a time that is only an estimate.
+pub(crate) fn duration_in_words(seconds: f64) -> String {
+    match seconds {
+        ..100.0 => format!("{seconds:.0} s"),
+        ..6000.0 => format!("{:.0} min", seconds / 60.0),
+        _ => format!("{:.1} h", seconds / 3600.0),
     }
 }
 

@@ -10,7 +10,7 @@ use rare::viewpoints::CameraChoice;
 use rare::{Recipe, RigidTransform};
 use serde::{Serialize, Serializer};
 
-use crate::options::{Encoder, Preset};
+use crate::options::{Encoder, Preset, Settings};
 use crate::run::{Inputs, Registration};
 
 type Matrix<const N: usize> = [[f64; N]; N];
@@ -57,6 +57,18 @@ struct Config<'a> {
     threads: usize,
     recipe: &'a Recipe,
     scale: Scale,
+}
+
+/// What made features.
+#[derive(Serialize)]
+struct Features {
+    encoder: Encoder,
+    preset: Preset,
+    profile: Profile,
+    camera: CameraChoice,
+    voxel: Option<f64>,
+    seed: u64,
+    version: &'static str,
 }
 
 /// Seconds by step, in the order of the steps.
@@ -106,6 +118,20 @@ pub(crate) fn to_json(registration: &Registration) -> Result<String> {
     Ok(serde_json::to_string_pretty(&record)? + "\n")
 }
 
+/// The settings that made features, which are kept with them.
+pub(crate) fn features_to_json(settings: &Settings) -> Result<String> {
+    let features = Features {
+        encoder: settings.encoder,
+        preset: settings.preset,
+        profile: settings.refiner.profile,
+        camera: settings.refiner.camera,
+        voxel: settings.refiner.voxel,
+        seed: settings.refiner.seed,
+        version: env!("CARGO_PKG_VERSION"),
+    };
+    Ok(serde_json::to_string_pretty(&features)? + "\n")
+}
+
 fn config(registration: &Registration) -> Config<'_> {
     let (settings, scale) = (&registration.settings, registration.refinement.scale);
     Config {
@@ -115,7 +141,7 @@ fn config(registration: &Registration) -> Config<'_> {
         camera: chosen_camera(settings.refiner.camera, scale.kind, &settings.refiner.recipe),
         voxel: scale.voxel,
         seed: settings.refiner.seed,
-        encoder: settings.encoder(),
+        encoder: settings.encoder,
         depth_features: settings.depth_features.as_ref().map(|file| file.display().to_string()),
         threads: rayon::current_num_threads(),
         recipe: &settings.refiner.recipe,

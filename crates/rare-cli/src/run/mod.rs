@@ -3,6 +3,7 @@
 mod completions;
 mod convert;
 mod demo;
+mod features;
 mod info;
 mod refine;
 mod register;
@@ -26,6 +27,7 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
     match cli.command {
         Command::Register(args) => register::run(args),
         Command::Refine(args) => refine::run(args),
+        Command::Features(args) => features::run(args),
         Command::Info(args) => info::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Demo(args) => demo::run(&args),

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result};
+use rare::encode::Recorded;
 use rare::{Correspondence, Refinement, Refiner, RigidTransform, Scan, io as files};
 
 use crate::args::{Clouds, Direction, RefineArgs, Start};
@@ -40,12 +41,12 @@ struct Problem {
 pub(super) fn registration(
     clouds: &Clouds,
     start: &Start,
-    settings: Settings,
+    mut settings: Settings,
 ) -> Result<Registration> {
     let clock = Instant::now();
     let progress = Progress::start(settings.quiet);
     progress.step("read");
-    let mut problem = read(clouds, start, &settings)?;
+    let mut problem = read(clouds, start, &mut settings)?;
     let read_seconds = clock.elapsed().as_secs_f64();
     problem.refiner = problem.refiner.with_progress(progress.callback());
     let refinement = problem.solve().with_context(|| which(clouds))?;
@@ -61,13 +62,12 @@ pub(super) fn registration(
     })
 }
 
-fn read(clouds: &Clouds, start: &Start, settings: &Settings) -> Result<Problem> {
+fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Problem> {
     // The small files first: what is wrong with them need not wait for the clouds.
-    let initial = read_initial(start)?;
+    let initial = read_initial(&start.init, start.init_direction)?;
+    let recorded = read_recorded(settings, &initial)?;
     let mut refiner = Refiner::new(settings.refiner.clone());
-    if let Some(file) = &settings.depth_features {
-        let recorded = files::read_depth_features(file)?;
-        recorded.check_initial(&initial).with_context(|| file.display().to_string())?;
+    if let Some(recorded) = recorded {
         refiner = refiner.with_encoder(Box::new(recorded));
     }
     let features = |file: &Option<PathBuf>| -> rare::Result<_> {
@@ -86,10 +86,19 @@ fn read(clouds: &Clouds, start: &Start, settings: &Settings) -> Result<Problem> 
     })
 }
 
+/// Recorded features, if they are asked for; they have their say in the recipe.
+fn read_recorded(settings: &mut Settings, initial: &RigidTransform) -> Result<Option<Recorded>> {
+    let Some(file) = &settings.depth_features else { return Ok(None) };
+    let recorded = files::read_depth_features(file)?;
+    recorded.check_initial(initial).with_context(|| file.display().to_string())?;
+    settings.refiner.recipe = settings.refiner.recipe.clone().for_recorded(&recorded);
+    Ok(Some(recorded))
+}
+
 /// The initial transform from source to reference.
-fn read_initial(start: &Start) -> Result<RigidTransform> {
-    let given = files::read_pose(&start.init)?;
-    Ok(match start.init_direction {
+pub(super) fn read_initial(init: &Path, direction: Direction) -> Result<RigidTransform> {
+    let given = files::read_pose(init)?;
+    Ok(match direction {
         Direction::SourceToTarget => given,
         Direction::TargetToSource => given.inverse(),
     })

@@ -6,3 +6,29 @@ mod pipeline;
 
 pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
 pub use pipeline::{Pipeline, TokenizerFiles};
+mod controlnet;
+mod layers;
+mod layout;
+mod noise;
+mod sampler;
+mod schedule;
+mod settings;
+mod text_encoder;
+mod tokenizer;
+mod unet;
+
+pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
+pub use controlnet::{Control, ControlNet};
+pub use layers::{Contexts, Timestep};
+pub use layout::{
+    Differences, Layout, Misshapen, compare, controlnet_layout, text_encoder_layout, unet_layout,
+};
+pub use noise::Noise;
+pub use sampler::Plan;
+pub use schedule::{Schedule, Step, cumulative_alphas};
+pub use settings::{
+    DiffusionSettings, INDOOR_PROMPT, NEGATIVE_PROMPT, Precision, Preset, STREET_PROMPT,
+};
+pub use text_encoder::TextEncoder;
+pub use tokenizer::{PROMPT_LENGTH, Tokenizer, Tokens, known_tokens};
+pub use unet::{Extent, LAYERS, Output, Unet};

@@ -4,7 +4,28 @@
 //! convolution takes the normalisation and activation before it and the bias, residual and activation after it, so
 //! that nothing is written to memory in between. Weights are opaque to the network: each backend packs them once, its
 //! own way.
+//!
+//! [`CpuBackend`] is the only one so far. From the outside in: `convolution` and `attention` cut the work into pieces
+//! for the threads, `operand` and `pack` put both sides of the product in order, `tile` multiplies them in registers,
+//! `simd` has the instructions of each processor. All unsafe code of the workspace is in this folder.
 
+mod arena;
+mod attention;
 mod backend;
+mod convolution;
+mod cpu;
+mod math;
+mod normalization;
+mod operand;
+mod pack;
+mod shared_output;
+mod simd;
+mod tensor;
+mod tile;
+mod vectors;
 
 pub use backend::{Activation, Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
+pub use cpu::{CpuBackend, Precision};
+pub use pack::PackedWeight;
+pub use simd::Processor;
+pub use tensor::Tensor;

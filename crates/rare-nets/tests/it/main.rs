@@ -1,6 +1,22 @@
 //! Integration tests: golden data and real files.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::print_stdout,
+    reason = "tests fail by panicking and say what they skip"
+)]
+
+mod checkpoint;
+mod network_shapes;
+mod networks;
+mod reference_backend;
+mod schedule;
+mod shared;
+mod text_encoder;
+mod tokenizer;
 #[cfg(feature = "fetch")]
 mod weights;
 #[cfg(feature = "fetch")]

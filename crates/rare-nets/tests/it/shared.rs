@@ -1,8 +1,10 @@
-//! Where the golden inputs and outputs lie.
+//! Where the golden inputs and outputs and the real data lie, and how to read the golden arrays.
 //!
 //! They stand beside a development checkout, never in it: a test that does not find them says so and passes,
 //! unless `RARE_REQUIRE_SHARED=1` makes the absence a failure.
 
+use std::fs::File;
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 /// The file or folder `relative` of the shared data, or `None` (with a printed line) where there is none.
@@ -21,4 +23,90 @@ pub(crate) fn path(relative: &str) -> Option<PathBuf> {
     );
     println!("skipped: no {}", path.display());
     None
+}
+
+/// One array of a golden file: shape and values, widened to `f64`, in C order.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Array {
+    pub(crate) shape: Vec<usize>,
+    pub(crate) values: Vec<f64>,
+}
+
+impl Array {
+    pub(crate) fn f32(&self) -> Vec<f32> {
+        self.values.iter().map(|&value| value as f32).collect()
+    }
+
+    pub(crate) fn usize(&self) -> Vec<usize> {
+        self.values.iter().map(|&value| value as usize).collect()
+    }
+}
+
+/// A golden `.npz` archive.
+pub(crate) struct Golden {
+    archive: npyz::npz::NpzArchive<BufReader<File>>,
+    path: PathBuf,
+}
+
+impl Golden {
+    /// Opens `golden/<relative>`; `None` where the shared data are missing.
+    pub(crate) fn open(relative: &str) -> Option<Golden> {
+        Golden::open_path(path(&format!("golden/{relative}"))?)
+    }
+
+    /// Opens any `.npz` file.
+    pub(crate) fn open_path(path: PathBuf) -> Option<Golden> {
+        let archive = npyz::npz::NpzArchive::open(&path).expect("a golden file opens");
+        Some(Golden { archive, path })
+    }
+
+    /// The array `name`, whatever its number type.
+    pub(crate) fn array(&mut self, name: &str) -> Array {
+        let npy = self
+            .archive
+            .by_name(name)
+            .expect("a golden file reads")
+            .unwrap_or_else(|| panic!("{}: no array {name}", self.path.display()));
+        let shape = npy.shape().iter().map(|&size| size as usize).collect();
+        let order = npy.order();
+        let npyz::DType::Plain(kind) = npy.dtype() else { panic!("{name}: structured array") };
+        let values = match kind.to_string().as_str() {
+            "<f4" => npy.into_vec::<f32>().unwrap().into_iter().map(f64::from).collect(),
+            "<f8" => npy.into_vec::<f64>().unwrap(),
+            "<i4" => npy.into_vec::<i32>().unwrap().into_iter().map(f64::from).collect(),
+            "<i8" => npy.into_vec::<i64>().unwrap().into_iter().map(|value| value as f64).collect(),
+            "|u1" => npy.into_vec::<u8>().unwrap().into_iter().map(f64::from).collect(),
+            "|b1" => npy.into_vec::<bool>().unwrap().into_iter().map(f64::from).collect(),
+            other => panic!("{name}: number type {other}"),
+        };
+        match order {
+            npyz::Order::C => Array { shape, values },
+            npyz::Order::Fortran => Array { values: transposed(&shape, &values), shape },
+        }
+    }
+
+    /// The names of all arrays, sorted.
+    pub(crate) fn names(&self) -> Vec<String> {
+        let mut names: Vec<String> = self.archive.array_names().map(str::to_owned).collect();
+        names.sort();
+        names
+    }
+}
+
+/// The values of a two-dimensional array in Fortran order, in C order.
+fn transposed(shape: &[usize], values: &[f64]) -> Vec<f64> {
+    let [rows, columns] = *shape else { panic!("an array in Fortran order with shape {shape:?}") };
+    (0..rows * columns).map(|at| values[at % columns * rows + at / columns]).collect()
+}
+
+/// The largest difference of two arrays over the largest value of the second, which is golden.
+pub(crate) fn relative_difference(values: &[f32], golden: &[f64]) -> f64 {
+    assert_eq!(values.len(), golden.len());
+    let largest = golden.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
+    let difference = values.iter().zip(golden).fold(0.0, |largest: f64, (value, golden)| {
+        // What is not a number is as far away as can be.
+        let difference = (f64::from(*value) - golden).abs();
+        if difference.is_nan() { f64::INFINITY } else { largest.max(difference) }
+    });
+    difference / largest
 }

@@ -1,0 +1,154 @@
+//! The backend on the CPU.
+
+use std::sync::Arc;
+
+use rare::{Error, Result};
+
+use super::arena::Arena;
+use super::attention::{self, Keys};
+use super::backend::{Backend, Convolution, Kernel, Shape};
+use super::convolution::{self, Context};
+use super::pack::{self, PackedWeight};
+use super::simd::Processor;
+use super::tensor::{Elements, Tensor, Values};
+
+/// The precision of products. Sums are always in single precision.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Precision {
+    /// Single precision.
+    #[default]
+    F32,
+    /// Factors are rounded to bf16.
+    Bf16,
+}
+
+impl Precision {
+    /// Units of 32 bits that this many values fill.
+    pub(super) fn units(self, values: usize) -> usize {
+        match self {
+            Precision::F32 => values,
+            Precision::Bf16 => values.div_ceil(2),
+        }
+    }
+}
+
+/// Computes networks on the CPU, on the threads of rayon's current pool. Results do not depend on their number.
+///
+/// ```
+/// use rare_nets::engine::{Backend, CpuBackend, Precision, Shape};
+/// let cpu = CpuBackend::new(Precision::F32)?;
+/// let shape = Shape { batch: 1, height: 1, width: 2, channels: 3 };
+/// let tensor = cpu.upload(shape, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0])?;
+/// assert_eq!(cpu.download(&tensor)?[4], 5.0);
+/// # Ok::<(), rare::Error>(())
+/// ```
+#[derive(Debug)]
+pub struct CpuBackend {
+    processor: Processor,
+    precision: Precision,
+    arena: Arc<Arena>,
+}
+
+impl CpuBackend {
+    /// With the best instructions of this machine, or those that the environment variable `RARE_CPU` forces.
+    ///
+    /// # Errors
+    /// `Unsupported` if the variable names instructions that this machine does not have.
+    pub fn new(precision: Precision) -> Result<CpuBackend> {
+        Ok(CpuBackend::on(Processor::detect()?, precision))
+    }
+
+    /// With these instructions.
+    #[must_use]
+    pub fn on(processor: Processor, precision: Precision) -> CpuBackend {
+        CpuBackend { processor, precision, arena: Arc::default() }
+    }
+
+    /// The instructions that are used.
+    #[must_use]
+    pub fn processor(&self) -> Processor {
+        self.processor
+    }
+
+    fn context(&self) -> Context<'_> {
+        Context { processor: self.processor, precision: self.precision, arena: &self.arena }
+    }
+}
+
+impl Backend for CpuBackend {
+    type Tensor = Tensor;
+    type Weight = PackedWeight;
+
+    fn pack(&self, kernel: &Kernel<'_>) -> Result<PackedWeight> {
+        pack::pack(self.processor, kernel, self.precision)
+    }
+
+    fn upload(&self, shape: Shape, values: &[f32]) -> Result<Tensor> {
+        if shape.values() != values.len() {
+            let count = values.len();
+            return Err(Error::Internal(format!("{count} values make no tensor of {shape:?}")));
+        }
+        let mut buffer = self.arena.lend(values.len() * 4);
+        buffer.slice_mut()[..values.len()].copy_from_slice(values);
+        Ok(Tensor { shape, elements: Elements::F32, buffer })
+    }
+
+    fn download(&self, tensor: &Tensor) -> Result<Vec<f32>> {
+        Ok(match tensor.values(0, tensor.shape.values()) {
+            Values::F32(values) => values.to_vec(),
+            Values::Bf16(values) => values.iter().map(|value| value.to_f32()).collect(),
+        })
+    }
+
+    fn shape(&self, tensor: &Tensor) -> Shape {
+        tensor.shape
+    }
+
+    fn convolve(
+        &self,
+        input: &Tensor,
+        weight: &PackedWeight,
+        fused: &Convolution<'_, Tensor>,
+    ) -> Result<Tensor> {
+        convolution::convolve(self.context(), input, weight, fused)
+    }
+
+    fn self_attention(&self, input: &Tensor, heads: usize, causal: bool) -> Result<Tensor> {
+        let channels = input.shape.channels / 3;
+        let keys = [Keys { tensor: input, first_key: channels, first_value: 2 * channels }];
+        attention::attend(self.context(), input, &keys, channels, heads, causal)
+    }
+
+    fn cross_attention(
+        &self,
+        queries: &Tensor,
+        contexts: &[&Tensor],
+        heads: usize,
+    ) -> Result<Tensor> {
+        let channels = queries.shape.channels;
+        let keys: Vec<Keys<'_>> = contexts
+            .iter()
+            .map(|tensor| Keys { tensor, first_key: 0, first_value: channels })
+            .collect();
+        attention::attend(self.context(), queries, &keys, channels, heads, false)
+    }
+
+    fn concatenate(&self, first: &Tensor, second: &Tensor) -> Result<Tensor> {
+        let pixels = |shape: Shape| (shape.batch, shape.height, shape.width);
+        let (Some(left), Some(right), true) =
+            (first.as_f32(), second.as_f32(), pixels(first.shape) == pixels(second.shape))
+        else {
+            let (first, second) = (first.shape, second.shape);
+            return Err(Error::Internal(format!("{first:?} and {second:?} cannot be joined")));
+        };
+        let (a, b) = (first.shape.channels, second.shape.channels);
+        let shape = Shape { channels: a + b, ..first.shape };
+        let mut buffer = self.arena.lend(shape.values() * 4);
+        let pixels = buffer.slice_mut::<f32>().chunks_exact_mut(a + b);
+        for ((pixel, left), right) in pixels.zip(left.chunks_exact(a)).zip(right.chunks_exact(b)) {
+            pixel[..a].copy_from_slice(left);
+            pixel[a..].copy_from_slice(right);
+        }
+        Ok(Tensor { shape, elements: Elements::F32, buffer })
+    }
+}
