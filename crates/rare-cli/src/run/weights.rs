@@ -53,21 +53,26 @@ fn describe(source: &Source) -> String {
     text
 }
 
-/// Prints the hash and name of every file, as `sha256sum` does, if all are what was fetched.
+/// Prints the hash and name of every file, as `sha256sum` does, if all are what was fetched and the networks can use
+/// them.
 fn check(args: CheckArgs) -> Result<u8> {
     let folder = match args.folder {
         Some(folder) => folder,
         None => default_folder(Choice::default())?,
     };
     let checked = weights::check(&folder)?;
+    let pipeline = weights::open(&folder)?;
     let line = |file: &weights::LockedFile| format!("{}  {}\n", file.sha256, file.file);
     print(&checked.lock.files().iter().map(line).collect::<String>())?;
     summary::say(&format!(
-        "{}: {} files, {:.1} MB, as they were fetched",
+        "{}: {} files, {:.1} MB, as they were fetched; all tensors have their names and shapes",
         folder.display(),
         checked.lock.files().len(),
         checked.bytes as f64 / 1e6
     ));
+    if let Some(remark) = pipeline.remark {
+        summary::say(&format!("warning: {remark}"));
+    }
     Ok(SUCCESS)
 }
 

@@ -2,14 +2,11 @@
 //! Extraction").
 
 mod config;
-mod pipeline;
-
-pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
-pub use pipeline::{Pipeline, TokenizerFiles};
 mod controlnet;
 mod layers;
 mod layout;
 mod noise;
+mod pipeline;
 mod sampler;
 mod schedule;
 mod settings;
@@ -20,10 +17,12 @@ mod unet;
 pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
 pub use controlnet::{Control, ControlNet};
 pub use layers::{Contexts, Timestep};
+pub(crate) use layout::require;
 pub use layout::{
     Differences, Layout, Misshapen, compare, controlnet_layout, text_encoder_layout, unet_layout,
 };
 pub use noise::Noise;
+pub use pipeline::{Pipeline, TokenizerFiles};
 pub use sampler::Plan;
 pub use schedule::{Schedule, Step, cumulative_alphas};
 pub use settings::{

@@ -1,6 +1,4 @@
 //! Integration tests: golden data and real files.
-#![allow(clippy::unwrap_used, clippy::panic)]
-
 #![expect(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -20,8 +18,5 @@ mod tokenizer;
 #[cfg(feature = "fetch")]
 mod weights;
 #[cfg(feature = "fetch")]
+#[expect(dead_code, reason = "shared with the tests of the program, which make other mistakes")]
 mod weights_server;
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout)]
-
-mod checkpoint;
-mod shared;

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
+use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
@@ -85,6 +86,18 @@ pub(crate) struct Server {
 impl Server {
     /// Serves made-up files under the names of the published ones.
     pub(crate) fn start() -> Server {
+        Server::serve(content)
+    }
+
+    /// Serves the files of a pipeline folder in single precision under the names of the published ones.
+    pub(crate) fn start_with(folder: &Path) -> Server {
+        Server::serve(|repository, path| {
+            let part = if repository.starts_with("lllyasviel/") { "controlnet" } else { "" };
+            std::fs::read(folder.join(part).join(path.replace(".fp16.", "."))).unwrap()
+        })
+    }
+
+    fn serve(content: impl Fn(&str, &str) -> Vec<u8>) -> Server {
         let mut state = State::default();
         let names = [
             ("stable-diffusion-v1-5/stable-diffusion-v1-5", &STABLE_DIFFUSION[..]),
