@@ -109,7 +109,7 @@ fn the_folder_is_by_default_beside_the_cache() {
     assert!(folder.starts_with(workplace.path("home")) && folder.join(UNET).is_file(), "{stdout}");
     // What was made up for the test is as it was fetched, but no network.
     let (code, _, stderr) = said(&workplace.run(&["check"]));
-    assert!(code == 2 && stderr.contains("config.json"), "{stderr}");
+    assert!(code == 2 && stderr.contains("model_index.json"), "{stderr}");
     let other = ["fetch", "--quiet", "--precision", "f32", "--controlnet", "v1.0"];
     let (code, other, _) = said(&workplace.run(&other));
     assert!(code == 0 && other != stdout && other.contains("v1.0-f32"), "{other}");
