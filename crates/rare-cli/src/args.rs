@@ -1,5 +1,7 @@
 //! What was typed.
 
+mod weights;
+
 use std::path::PathBuf;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
@@ -7,6 +9,9 @@ use clap_complete::Shell;
 use rare::InitialMethod;
 use serde::Serialize;
 
+#[cfg(feature = "fetch")]
+pub(crate) use self::weights::FetchArgs;
+pub(crate) use self::weights::{CheckArgs, WeightsArgs, WeightsCommand};
 use crate::options::{Options, choice};
 
 const EXAMPLES: &str = "\
@@ -72,6 +77,8 @@ pub(crate) enum Command {
     Convert(ConvertArgs),
     /// Simulate two scans of a room, register them from a wrong start and compare with the truth
     Demo(DemoArgs),
+    /// Get and check the weights of the diffusion features
+    Weights(WeightsArgs),
     /// Print the completion script of a shell
     Completions(CompletionsArgs),
 }

@@ -7,6 +7,7 @@ mod features;
 mod info;
 mod refine;
 mod register;
+mod weights;
 
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
@@ -31,6 +32,7 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
         Command::Info(args) => info::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Demo(args) => demo::run(&args),
+        Command::Weights(args) => weights::run(args),
         Command::Completions(args) => completions::run(&args),
     }
 }

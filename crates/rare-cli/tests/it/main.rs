@@ -10,3 +10,9 @@ mod outputs;
 mod readme;
 mod registration;
 mod shared;
+#[cfg(feature = "fetch")]
+mod weights;
+#[cfg(feature = "fetch")]
+#[path = "../../../rare-nets/tests/it/weights_server.rs"]
+#[expect(dead_code, reason = "shared with the tests of the library, which make more mistakes")]
+mod weights_server;

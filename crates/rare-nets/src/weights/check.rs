@@ -1,4 +1,4 @@
-//! Whether a folder still holds what was put into it.
+//! Whether a folder still holds what was put into it, and whether the networks can use that.
 
 use std::fs;
 use std::io::ErrorKind;
@@ -8,6 +8,7 @@ use rare::{Error, Result};
 
 use super::digest::fingerprint;
 use super::lock::{LOCK_FILE, Lock, LockedFile};
+use crate::diffusion::{Pipeline, controlnet_layout, require, text_encoder_layout, unet_layout};
 
 /// A folder that holds what its record says, and all of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,6 +41,21 @@ pub fn check(folder: &Path) -> Result<Checked> {
     lock.files().iter().try_for_each(|file| check_file(folder, file))?;
     let bytes = lock.files().iter().map(|file| file.bytes).sum();
     Ok(Checked { lock, bytes })
+}
+
+/// Opens the pipeline in a folder, wherever it is from, and compares the names and shapes of all tensors with those of
+/// the networks; no value is read.
+///
+/// # Errors
+/// Those of [`Pipeline::open`], and `InvalidInput` with the first tensors that are missing, unknown or of another shape.
+pub fn open(folder: &Path) -> Result<Pipeline> {
+    let pipeline = Pipeline::open(folder)?;
+    require(&unet_layout(&pipeline.unet_config), &pipeline.unet, "U-Net")?;
+    let controlnet = controlnet_layout(&pipeline.controlnet_config);
+    require(&controlnet, &pipeline.controlnet, "ControlNet")?;
+    let text_encoder = text_encoder_layout(&pipeline.text_config);
+    require(&text_encoder, &pipeline.text_encoder, "text encoder")?;
+    Ok(pipeline)
 }
 
 /// The files of the pipeline that the record does not have.

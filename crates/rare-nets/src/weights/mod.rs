@@ -2,7 +2,7 @@
 //!
 //! [`SOURCES`] names the repositories and files. `fetch` (cargo feature `fetch`) makes a pipeline folder of them and
 //! writes beside them a [`Lock`]: what each file is, by content. [`check`] compares a folder with its lock later, without
-//! a network.
+//! the internet, and [`open`] its tensors with what the networks need.
 //!
 //! The lengths and hashes of the table are those that somebody has verified; where there is none, a download can only be
 //! compared with what the server announces, and the lock records what that was.
@@ -15,7 +15,7 @@ mod hub;
 mod lock;
 mod sources;
 
-pub use check::{Checked, check};
+pub use check::{Checked, check, open};
 pub use hub::{Hub, Token};
 pub use lock::{LOCK_FILE, Lock, LockedFile};
 pub use sources::{Choice, ControlNetVersion, Precision, SOURCES, Source, SourceFile};

@@ -21,4 +21,5 @@ mod tokenizer;
 #[cfg(feature = "fetch")]
 mod weights;
 #[cfg(feature = "fetch")]
+#[expect(dead_code, reason = "shared with the tests of the program, which make other mistakes")]
 mod weights_server;

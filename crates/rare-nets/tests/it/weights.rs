@@ -6,10 +6,11 @@ mod workplace;
 use std::fs;
 use std::path::Path;
 
-use rare_nets::weights::{Choice, ControlNetVersion, Precision, check};
+use rare_nets::weights::{Choice, ControlNetVersion, Precision, check, open};
 
 use self::workplace::{CONTROLNET, STABLE_DIFFUSION, UNET, Workplace};
-use crate::weights_server::{COMMIT, content, is_large, tag};
+use crate::shared;
+use crate::weights_server::{COMMIT, Server, content, is_large, tag};
 
 #[test]
 fn a_folder_is_made_of_what_is_published_and_recorded() {
@@ -148,4 +149,23 @@ fn a_check_finds_what_has_changed() {
     refuse(&|path| fs::write(path, vec![0; 300_000]).unwrap(), "SHA-256");
     refuse(&|path| fs::write(path, "short").unwrap(), "5 bytes, recorded were 300000");
     refuse(&|path| fs::remove_file(path).unwrap(), "no such file");
+}
+
+#[test]
+fn a_fetched_pipeline_opens_and_misfits_are_named() {
+    let Some(folder) = shared::path("golden/rare/tiny-pipeline") else { return };
+    let workplace = Workplace::with(Server::start_with(&folder));
+    workplace.fetch().lock();
+    check(&workplace.folder()).unwrap();
+    let pipeline = open(&workplace.folder()).unwrap();
+    assert!(pipeline.files.contains(&workplace.path(UNET)), "{:?}", pipeline.files);
+    let config = workplace.path("text_encoder/config.json");
+    let text = fs::read_to_string(&config).unwrap();
+    let layers = |count: u32| format!("\"num_hidden_layers\": {count}");
+    assert!(text.contains(&layers(3)), "{text}");
+    fs::write(&config, text.replace(&layers(3), &layers(4))).unwrap();
+    let message = open(&workplace.folder()).unwrap_err().to_string();
+    for word in ["text encoder", "missing", "text_model.encoder.layers.3."] {
+        assert!(message.contains(word), "{word} is missing in {message}");
+    }
 }

@@ -3,8 +3,10 @@
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
+use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::thread;
+use std::time::Duration;
 
 use sha1::Sha1;
 use sha2::{Digest, Sha256};
@@ -35,6 +37,8 @@ const CONTROLNET: [&str; 3] = [
 pub(crate) enum Fault {
     /// The connection breaks after so many bytes of a body, so many times.
     Break { after: usize, times: usize },
+    /// Nothing more comes after so many bytes of a body, but the connection stays.
+    Stall { after: usize },
     /// Another content of the same length.
     WrongContent,
     /// One byte more or less than announced, with a header that admits it.
@@ -82,6 +86,18 @@ pub(crate) struct Server {
 impl Server {
     /// Serves made-up files under the names of the published ones.
     pub(crate) fn start() -> Server {
+        Server::serve(content)
+    }
+
+    /// Serves the files of a pipeline folder in single precision under the names of the published ones.
+    pub(crate) fn start_with(folder: &Path) -> Server {
+        Server::serve(|repository, path| {
+            let part = if repository.starts_with("lllyasviel/") { "controlnet" } else { "" };
+            std::fs::read(folder.join(part).join(path.replace(".fp16.", "."))).unwrap()
+        })
+    }
+
+    fn serve(content: impl Fn(&str, &str) -> Vec<u8>) -> Server {
         let mut state = State::default();
         let names = [
             ("stable-diffusion-v1-5/stable-diffusion-v1-5", &STABLE_DIFFUSION[..]),
@@ -337,6 +353,16 @@ fn send_file(
     }
     if let Some(start) = start {
         headers.push(("Content-Range", format!("bytes {start}-{}/{total}", total - 1)));
+    }
+    for fault in &faults {
+        if let Fault::Stall { after } = fault {
+            let open = stream.try_clone()?;
+            thread::spawn(move || {
+                thread::sleep(Duration::from_secs(60));
+                drop(open);
+            });
+            return send(stream, status, &headers, &body[..*after]);
+        }
     }
     for (word, fault) in &mut state.faults {
         if let Fault::Break { after, times } = fault

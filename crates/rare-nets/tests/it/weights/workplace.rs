@@ -28,7 +28,10 @@ pub(crate) struct Run {
 
 impl Workplace {
     pub(crate) fn new() -> Workplace {
-        let server = Server::start();
+        Workplace::with(Server::start())
+    }
+
+    pub(crate) fn with(server: Server) -> Workplace {
         let root = tempfile::tempdir().unwrap();
         let hub = Hub {
             endpoint: server.endpoint(),
