@@ -1,4 +1,4 @@
-//! Speed of the engine's operations on the shapes of Stable Diffusion 1.5: `engine_speed [f32|bf16]`.
+//! Speed of the engine's operations on the shapes of Stable Diffusion 1.5: `engine_speed [f32|bf16] [attention]`.
 //!
 //! Prints billions of operations per second of CPU time (Linux) over the best of some runs; `RARE_CPU` forces a set of
 //! instructions, `RAYON_NUM_THREADS` the number of threads.
@@ -20,15 +20,22 @@ fn main() -> Result<(), Box<dyn Error>> {
     };
     let cpu = CpuBackend::new(precision)?;
     println!("{} {precision:?}", cpu.processor().name());
-    for (channels, height, width) in [(320, 64, 88), (640, 32, 44), (1280, 16, 22), (1280, 8, 11)] {
-        convolution(&cpu, channels, channels, 3, [height, width])?;
+    if std::env::args().nth(2).as_deref() != Some("attention") {
+        convolutions(&cpu)?;
     }
-    convolution(&cpu, 320, 2560, 1, [64, 88])?;
-    convolution(&cpu, 320, 320, 1, [64, 88])?;
-    convolution(&cpu, 1280, 320, 1, [64, 88])?;
     for (channels, height, width) in [(320, 64, 88), (640, 32, 44), (1280, 16, 22)] {
         attention(&cpu, channels, [height, width])?;
     }
+    Ok(())
+}
+
+fn convolutions(cpu: &CpuBackend) -> Result<(), Box<dyn Error>> {
+    for (channels, height, width) in [(320, 64, 88), (640, 32, 44), (1280, 16, 22), (1280, 8, 11)] {
+        convolution(cpu, channels, channels, 3, [height, width])?;
+    }
+    convolution(cpu, 320, 2560, 1, [64, 88])?;
+    convolution(cpu, 320, 320, 1, [64, 88])?;
+    convolution(cpu, 1280, 320, 1, [64, 88])?;
     Ok(())
 }
 

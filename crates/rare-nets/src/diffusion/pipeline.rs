@@ -135,16 +135,6 @@ fn check_together(
 ) -> Result<()> {
     let (ours, theirs) = (&unet.config, &controlnet.config.unet);
     if ours != theirs {
-        let shown = |config: &UnetConfig| {
-            format!(
-                "{} latent channels, channels {:?}, {} heads, a context of {}, {} groups",
-                config.in_channels,
-                config.block_out_channels,
-                config.heads,
-                config.cross_attention_dim,
-                config.groups
-            )
-        };
         return Err(Error::in_file(
             controlnet.named_file(),
             format!(
@@ -167,4 +157,16 @@ fn check_together(
         ));
     }
     Ok(())
+}
+
+/// The sizes in words, for a message.
+fn shown(config: &UnetConfig) -> String {
+    format!(
+        "{} latent channels, channels {:?}, {} heads, a context of {}, {} groups",
+        config.in_channels,
+        config.block_out_channels,
+        config.heads,
+        config.cross_attention_dim,
+        config.groups
+    )
 }

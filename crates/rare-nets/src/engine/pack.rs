@@ -71,6 +71,7 @@ impl PackedWeight {
 
     /// The columns of one panel for some steps (counted over all taps), widened into `scratch` if they are stored
     /// narrower.
+    #[inline(always)]
     pub(super) fn block<'a, S: Simd>(
         &'a self,
         simd: S,
@@ -83,29 +84,23 @@ impl PackedWeight {
         match self.storage {
             Storage::F32 | Storage::Pairs => &self.elements.slice::<f32>()[range],
             Storage::F16 => {
-                widen(&self.elements.slice::<f16>()[range], scratch, |v| simd.load_f16(v), simd)
+                let (narrow, _) = self.elements.slice::<f16>()[range].as_chunks::<LANES>();
+                let (wide, _) = scratch.as_chunks_mut::<LANES>();
+                for (narrow, wide) in narrow.iter().zip(wide) {
+                    simd.store(simd.load_f16(narrow), wide);
+                }
+                &scratch[..narrow.len() * LANES]
             }
             Storage::Bf16 => {
-                widen(&self.elements.slice::<bf16>()[range], scratch, |v| simd.load_bf16(v), simd)
+                let (narrow, _) = self.elements.slice::<bf16>()[range].as_chunks::<LANES>();
+                let (wide, _) = scratch.as_chunks_mut::<LANES>();
+                for (narrow, wide) in narrow.iter().zip(wide) {
+                    simd.store(simd.load_bf16(narrow), wide);
+                }
+                &scratch[..narrow.len() * LANES]
             }
         }
     }
-}
-
-/// Converts whole vectors.
-#[inline(always)]
-fn widen<'a, S: Simd, T>(
-    narrow: &[T],
-    wide: &'a mut [f32],
-    load: impl Fn(&[T; LANES]) -> S::Floats,
-    simd: S,
-) -> &'a [f32] {
-    let (narrow, _) = narrow.as_chunks::<LANES>();
-    let (targets, _) = wide.as_chunks_mut::<LANES>();
-    for (narrow, target) in narrow.iter().zip(targets) {
-        simd.store(load(narrow), target);
-    }
-    &wide[..narrow.len() * LANES]
 }
 
 /// The sizes of a kernel.

@@ -127,6 +127,7 @@ impl Tile<'_> {
     /// There are `ROWS` rows; `b` has `GROUPS * LANES` columns of all steps, `c` of all rows, and `a` all segments of
     /// all rows.
     #[inline(always)]
+    #[expect(clippy::needless_range_loop, reason = "iterators would move the sums")]
     pub(super) unsafe fn registers<
         S: Simd,
         const PAIRS: bool,
@@ -138,42 +139,41 @@ impl Tile<'_> {
         b: *const f32,
         c: *mut f32,
     ) {
-        let group = |pointer: *const f32, group: usize| {
-            // SAFETY: the caller vouches for the columns.
-            simd.load(unsafe { &*pointer.add(group * LANES).cast::<[f32; LANES]>() })
-        };
+        // Indices instead of iterators: the sums must never be moved, or they leave their registers.
         let mut sums = [[simd.splat(0.0); GROUPS]; ROWS];
         if self.accumulate {
-            for (row, sums) in sums.iter_mut().enumerate() {
-                for (index, sum) in sums.iter_mut().enumerate() {
+            for row in 0..ROWS {
+                for group in 0..GROUPS {
                     // SAFETY: the caller vouches for the rows of `c`.
-                    *sum = group(unsafe { c.add(row * self.c_stride) }, index);
+                    sums[row][group] = simd.load(unsafe { place(c, row * self.c_stride, group) });
                 }
             }
         }
         let mut b = b;
         for segment in self.segments {
             let mut a = [std::ptr::null(); ROWS];
-            for (row, a) in a.iter_mut().enumerate() {
+            for row in 0..ROWS {
                 // SAFETY: the caller vouches for the segments of all rows.
-                *a = unsafe {
+                a[row] = unsafe {
                     let start = *self.rows.get_unchecked(row) as usize + segment.offset as usize;
                     self.a.as_ptr().add(start)
                 };
             }
             for step in 0..segment.steps as usize {
                 let mut columns = [simd.splat(0.0); GROUPS];
-                for (index, column) in columns.iter_mut().enumerate() {
-                    *column = group(b, index);
+                for group in 0..GROUPS {
+                    // SAFETY: the caller vouches for the columns of this step.
+                    columns[group] = simd.load(unsafe { place(b.cast_mut(), 0, group) });
                 }
-                for (row, sums) in sums.iter_mut().enumerate() {
+                for row in 0..ROWS {
                     // SAFETY: `step` is within the segment.
                     let factor = simd.splat(unsafe { *a[row].add(step) });
-                    for (sum, column) in sums.iter_mut().zip(columns) {
-                        *sum = if PAIRS {
-                            simd.dot_pairs(factor, column, *sum)
+                    for group in 0..GROUPS {
+                        let sum = sums[row][group];
+                        sums[row][group] = if PAIRS {
+                            simd.dot_pairs(factor, columns[group], sum)
                         } else {
-                            simd.mul_add(factor, column, *sum)
+                            simd.mul_add(factor, columns[group], sum)
                         };
                     }
                 }
@@ -181,14 +181,21 @@ impl Tile<'_> {
                 b = b.wrapping_add(self.b_stride);
             }
         }
-        for (row, sums) in sums.into_iter().enumerate() {
-            for (index, sum) in sums.into_iter().enumerate() {
+        for row in 0..ROWS {
+            for group in 0..GROUPS {
                 // SAFETY: the caller vouches for the rows of `c`.
-                let place = unsafe {
-                    &mut *c.add(row * self.c_stride + index * LANES).cast::<[f32; LANES]>()
-                };
-                simd.store(sum, place);
+                simd.store(sums[row][group], unsafe { place(c, row * self.c_stride, group) });
             }
         }
     }
+}
+
+/// A group of columns of a row.
+///
+/// # Safety
+/// The group exists and nothing else refers to it.
+#[inline(always)]
+unsafe fn place<'a>(start: *mut f32, row: usize, group: usize) -> &'a mut [f32; LANES] {
+    // SAFETY: what the caller vouches for.
+    unsafe { &mut *start.add(row + group * LANES).cast() }
 }
