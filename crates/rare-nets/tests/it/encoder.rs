@@ -5,7 +5,10 @@ use std::sync::{Arc, Mutex};
 use rare::data::{Intrinsics, LayeredFeatures};
 use rare::encode::DepthEncoder;
 use rare::{DepthMap, FeatureMap, Result};
-use rare_nets::diffusion::{DiffusionEncoder, DiffusionSettings, Pipeline, Preset};
+use rare_nets::diffusion::{
+    Cost, DiffusionEncoder, DiffusionSettings, Extent, Pipeline, Plan, Preset,
+    controlnet_operations, hint_operations, latent_size, unet_operations,
+};
 use rare_nets::engine::{CpuBackend, Precision};
 
 use crate::shared;
@@ -150,4 +153,36 @@ fn parts_of_other_models_are_refused() {
     pipeline.text_config.vocabulary = 49408;
     pipeline.text_config.positions = 50;
     assert!(refused(&pipeline).contains("takes 50"), "{}", refused(&pipeline));
+}
+
+#[test]
+fn the_cost_counts_passes_maps_and_weights() {
+    let Some(pipeline) = pipeline() else { return };
+    let cost = |preset: Preset, precision, maps| {
+        let plan = Plan::new(&preset.settings(), &pipeline.scheduler).unwrap();
+        let size = latent_size(&Intrinsics::indoor()).unwrap();
+        Cost::estimate(&pipeline, &plan, precision, &vec![size; maps]).unwrap()
+    };
+    let single = cost(Preset::SingleStep, Precision::F32, 1);
+    let size = latent_size(&Intrinsics::indoor()).unwrap();
+    let pass = |extent| {
+        unet_operations(&pipeline.unet_config, size, extent)
+            + controlnet_operations(&pipeline.controlnet_config, size, extent)
+    };
+    let hint = hint_operations(&pipeline.controlnet_config, size);
+    assert_eq!(single.operations, hint + pass(Extent::UpToLayer(6)));
+    let paper = cost(Preset::Paper, Precision::F32, 1);
+    let expected = hint + 34.0 * pass(Extent::Whole) + pass(Extent::UpToLayer(6));
+    assert!((paper.operations / expected - 1.0).abs() < 1e-12);
+    // The whole networks: of the size of their files but for the headers.
+    let files = pipeline.unet.files().iter().chain(pipeline.controlnet.files());
+    let bytes: u64 = files.map(|file| std::fs::metadata(file).unwrap().len()).sum();
+    assert!((paper.weight_bytes as f64 / bytes as f64 - 1.0).abs() < 0.03);
+    assert!(single.weight_bytes < paper.weight_bytes);
+    let rough = cost(Preset::Paper, Precision::Bf16, 1);
+    assert_eq!(2 * rough.weight_bytes, paper.weight_bytes);
+    let four = cost(Preset::SingleStep, Precision::F32, 4);
+    assert_eq!(four.operations, 4.0 * single.operations);
+    assert!(four.other_bytes > single.other_bytes && paper.other_bytes > single.other_bytes);
+    assert_eq!(cost(Preset::Paper, Precision::F32, 0).operations, 0.0);
 }
