@@ -83,3 +83,54 @@ impl Drop for Lent {
         self.arena.free.lock().unwrap_or_else(PoisonError::into_inner).push(buffer);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::{Arena, Buffer};
+
+    fn size(bytes: usize) -> usize {
+        Arc::new(Arena::default()).lend(bytes).slice::<u8>().len()
+    }
+
+    #[test]
+    fn buffers_are_whole_cache_lines() {
+        for (bytes, expected) in [(0, 0), (1, 64), (64, 64), (65, 128), (1000, 1024)] {
+            assert_eq!(size(bytes), expected);
+        }
+        let buffer = Buffer::zeroed(1000);
+        assert_eq!(buffer.slice::<f32>().as_ptr().align_offset(64), 0);
+        assert!(buffer.slice::<u8>().iter().all(|&byte| byte == 0));
+    }
+
+    #[test]
+    fn a_buffer_comes_back_with_what_was_in_it() {
+        let arena = Arc::new(Arena::default());
+        let mut lent = arena.lend(1024);
+        lent.slice_mut::<f32>()[255] = 7.0;
+        // While it is lent, it is nobody else's.
+        assert_eq!(arena.lend(1024).slice::<f32>()[255], 0.0);
+        drop(lent);
+        let again = [arena.lend(1000), arena.lend(1000)];
+        let numbers = again.iter().map(|lent| lent.slice::<f32>()[255]).sum::<f32>();
+        assert_eq!(numbers, 7.0);
+        assert_eq!(arena.free.lock().unwrap().len(), 0);
+        drop(again);
+        assert_eq!(arena.free.lock().unwrap().len(), 2);
+    }
+
+    #[test]
+    fn the_smallest_that_is_large_enough_is_lent() {
+        let arena = Arc::new(Arena::default());
+        drop([2048, 640, 1024, 512].map(|bytes| arena.lend(bytes)));
+        let lent = |bytes| arena.lend(bytes).slice::<u8>().len();
+        assert_eq!(lent(600), 640);
+        assert_eq!(lent(641), 1024);
+        assert_eq!(lent(1024), 1024);
+        assert_eq!(lent(1025), 2048);
+        // Not one of more than twice the size, and not one that is too small: new ones.
+        assert_eq!(lent(192), 192);
+        assert_eq!(lent(4096), 4096);
+    }
+}

@@ -45,7 +45,7 @@ pub(super) fn attend(
     causal: bool,
 ) -> Result<Tensor> {
     let images = sources(queries, keys);
-    let fits = |keys: &Keys<'_>| keys.first_value + channels <= keys.tensor.shape.channels;
+    let fits = |keys: &Keys<'_>| keys.first_value + channels == keys.tensor.shape.channels;
     let divides = heads > 0 && channels > 0 && channels.is_multiple_of(heads);
     if images.is_empty() || !divides || !keys.iter().all(fits) {
         return Err(Error::Internal(format!(

@@ -108,7 +108,7 @@ pub struct Convolution<'a, T> {
     pub upsample: bool,
     /// 1, or 2 to keep every other row and column, starting with the first.
     pub stride: usize,
-    /// A summand per output, beside the bias: a tensor of one pixel.
+    /// A summand per output, beside the bias: a tensor of one pixel. Not with gated outputs.
     pub offset: Option<&'a T>,
     /// After.
     pub activation: Activation,
@@ -151,7 +151,7 @@ pub trait Backend: Send + Sync {
     /// Takes values in the order image, row, column, channel.
     ///
     /// # Errors
-    /// `Internal` if the number of values is not that of the shape.
+    /// `Internal` if the number of values is not that of the shape, or if there are none.
     fn upload(&self, shape: Shape, values: &[f32]) -> Result<Self::Tensor>;
 
     /// The values in the order image, row, column, channel.

@@ -11,7 +11,7 @@ use rare::{Error, Result};
 use rayon::prelude::*;
 
 use super::arena::Arena;
-use super::backend::{Activation, Arrangement, Convolution, Shape};
+use super::backend::{Activation, Arrangement, Convolution, Prologue, Shape};
 use super::cpu::Precision;
 use super::math::{gelu, sigmoid_linear};
 use super::operand::{Layout, Preparation};
@@ -43,8 +43,8 @@ pub(super) fn convolve(
     weight: &PackedWeight,
     fused: &Convolution<'_, Tensor>,
 ) -> Result<Tensor> {
-    check(input, weight, fused)?;
     let Context { processor, precision, arena } = context;
+    check(input, weight, fused, precision)?;
     let preparation = Preparation {
         processor,
         arena,
@@ -53,8 +53,15 @@ pub(super) fn convolve(
         upsample: fused.upsample,
         border: weight.side / 2,
     };
+    let layout = preparation.layout(input);
+    if !layout.is_addressable(input.shape.batch) {
+        return Err(Error::Unsupported(format!(
+            "the images {:?} are too large for one convolution: use fewer or smaller ones",
+            input.shape
+        )));
+    }
     let operand = preparation.prepare(input);
-    let geometry = Geometry::new(input, weight, fused, preparation.layout(input));
+    let geometry = Geometry::new(input, weight, fused, layout);
     let shape = geometry.shape;
     let elements = match (precision, fused.intermediate) {
         (Precision::Bf16, true) => Elements::Bf16,
@@ -70,8 +77,12 @@ pub(super) fn convolve(
     Ok(Tensor { shape, elements, buffer })
 }
 
-fn check(input: &Tensor, weight: &PackedWeight, fused: &Convolution<'_, Tensor>) -> Result<()> {
-    use super::backend::Prologue;
+fn check(
+    input: &Tensor,
+    weight: &PackedWeight,
+    fused: &Convolution<'_, Tensor>,
+    precision: Precision,
+) -> Result<()> {
     let channels = input.shape.channels;
     let normalized = match fused.prologue {
         Prologue::None | Prologue::Silu => true,
@@ -85,12 +96,16 @@ fn check(input: &Tensor, weight: &PackedWeight, fused: &Convolution<'_, Tensor>)
             scale.len() == channels && shift.len() == channels
         }
     };
-    if channels == weight.inputs && normalized && matches!(fused.stride, 1 | 2) {
+    let fits = channels == weight.inputs && weight.precision() == precision;
+    if fits && normalized && matches!(fused.stride, 1 | 2) {
         return Ok(());
     }
     Err(Error::Internal(format!(
-        "a convolution of {} inputs (stride {}) and its normalisation do not fit {:?}",
-        weight.inputs, fused.stride, input.shape
+        "a convolution of {} inputs (stride {}, {:?}) and its normalisation do not fit {:?} in {precision:?}",
+        weight.inputs,
+        fused.stride,
+        weight.precision(),
+        input.shape
     )))
 }
 
@@ -252,11 +267,11 @@ impl<'a> Epilogue<'a> {
     ) -> Result<Epilogue<'a>> {
         let mut summands = weight.bias.clone();
         if let Some(offset) = fused.offset {
-            let offset = offset.as_f32().filter(|offset| {
-                offset.len() == shape.channels && weight.arrangement == Arrangement::Plain
-            });
-            let offset = offset.ok_or_else(|| unfit("an offset", shape))?;
-            summands.iter_mut().zip(offset).for_each(|(sum, offset)| *sum += offset);
+            let one = Shape { batch: 1, height: 1, width: 1, ..shape };
+            let fits = offset.shape == one && weight.arrangement == Arrangement::Plain;
+            let values = offset.as_f32().filter(|_| fits);
+            let values = values.ok_or_else(|| unfit("an offset", shape))?;
+            summands.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
         }
         let residual = match fused.residual {
             Some(residual) => Some(check_residual(residual, shape)?),

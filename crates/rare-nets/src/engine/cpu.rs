@@ -86,7 +86,10 @@ impl Backend for CpuBackend {
     }
 
     fn upload(&self, shape: Shape, values: &[f32]) -> Result<Tensor> {
-        if shape.values() != values.len() {
+        let sizes = [shape.batch, shape.height, shape.width, shape.channels];
+        let count = sizes.into_iter().try_fold(1, usize::checked_mul);
+        // No tensor is empty: so no operation needs to say what it does then.
+        if values.is_empty() || count != Some(values.len()) {
             let count = values.len();
             return Err(Error::Internal(format!("{count} values make no tensor of {shape:?}")));
         }
@@ -128,6 +131,9 @@ impl Backend for CpuBackend {
         heads: usize,
     ) -> Result<Tensor> {
         let channels = queries.shape.channels;
+        if let Some(context) = contexts.iter().find(|context| context.shape.batch != 1) {
+            return Err(Error::Internal(format!("{:?} is no context of one image", context.shape)));
+        }
         let keys: Vec<Keys<'_>> = contexts
             .iter()
             .map(|tensor| Keys { tensor, first_key: 0, first_value: channels })

@@ -172,12 +172,15 @@ pub(super) fn pixel_moments<S: Simd>(simd: S, pixel: Values<'_>, epsilon: f32) -
     }
     let mean = simd.sum(sum) / count as f32;
     let mut squares = simd.splat(0.0);
-    for channel in (0..count).step_by(LANES) {
+    let whole = count - count % LANES;
+    for channel in (0..whole).step_by(LANES) {
         let deviation = simd.sub(load_values(simd, pixel, channel), simd.splat(mean));
         squares = simd.mul_add(deviation, deviation, squares);
     }
-    // What was read beyond the last channel was zero: its squared deviation does not belong to the pixel.
-    let beyond = count.next_multiple_of(LANES) - count;
-    let squares = simd.sum(squares) - beyond as f32 * mean * mean;
-    (mean, 1.0 / (squares.max(0.0) / count as f32 + epsilon).sqrt())
+    // Beyond the last channel zero is read, whose deviation is not zero: it would drown that of the pixel.
+    let mut rest = [0.0; LANES];
+    simd.store(load_values(simd, pixel, whole), &mut rest);
+    let rest = rest[..count - whole].iter().map(|value| (value - mean) * (value - mean));
+    let squares = simd.sum(squares) + rest.sum::<f32>();
+    (mean, 1.0 / (squares / count as f32 + epsilon).sqrt())
 }

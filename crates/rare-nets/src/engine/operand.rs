@@ -35,6 +35,15 @@ pub(super) struct Layout {
     pub(super) units: usize,
 }
 
+impl Layout {
+    /// Whether offsets of 32 bits reach all units of this many images.
+    pub(super) fn is_addressable(&self, images: usize) -> bool {
+        let sizes = [self.height, self.width, self.units];
+        let units = sizes.into_iter().try_fold(images, usize::checked_mul);
+        units.is_some_and(|units| u32::try_from(units).is_ok())
+    }
+}
+
 impl Operand<'_> {
     /// Everything, in units of 32 bits.
     pub(super) fn units(&self) -> &[f32] {
@@ -190,4 +199,17 @@ fn write<S: Simd, T: Element>(
         store(simd, value, channels, channel);
     }
     beyond.fill(T::default());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Layout;
+
+    #[test]
+    fn offsets_of_32_bits_end_somewhere() {
+        let layout = Layout { height: 1 << 10, width: 1 << 10, units: 1 << 10 };
+        assert!(layout.is_addressable(3));
+        assert!(!layout.is_addressable(4));
+        assert!(!layout.is_addressable(1 << 34));
+    }
 }

@@ -59,6 +59,14 @@ impl Storage {
 }
 
 impl PackedWeight {
+    /// The products that the weights were packed for.
+    pub(super) fn precision(&self) -> Precision {
+        match self.storage {
+            Storage::F32 | Storage::F16 | Storage::Bf16 => Precision::F32,
+            Storage::Pairs => Precision::Bf16,
+        }
+    }
+
     /// Units of one tap: inputs, or pairs of them.
     pub(super) fn steps(&self) -> usize {
         if self.storage == Storage::Pairs { self.inputs.div_ceil(2) } else { self.inputs }
@@ -132,7 +140,7 @@ pub(super) fn pack(
         Storage::F32 => permute(&as_f32(parts), sizes, &order, 1, elements.slice_mut()),
         Storage::F16 => permute(&as_f16(parts), sizes, &order, 1, elements.slice_mut()),
         Storage::Bf16 => {
-            permute(&as_bf16(processor, parts), sizes, &order, 1, elements.slice_mut())
+            permute(&as_bf16(processor, parts), sizes, &order, 1, elements.slice_mut());
         }
         Storage::Pairs => {
             permute(&as_bf16(processor, parts), sizes, &order, 2, elements.slice_mut());
@@ -167,16 +175,18 @@ fn sizes(kernel: &Kernel<'_>) -> Result<Sizes> {
     };
     let shapes: Option<Vec<_>> = kernel.parts.iter().map(shape_of).collect();
     let shapes = shapes.unwrap_or_default();
-    let fits = |&(rows, inputs, side): &(usize, usize, usize), part: &Parameter| {
+    let fits = |&(_, inputs, side): &(usize, usize, usize), part: &Parameter| {
+        let count = part.shape.iter().copied().try_fold(1, usize::checked_mul);
         (inputs, side) == (shapes[0].1, shapes[0].2)
-            && rows * inputs * side * side == part.values.len()
+            && !part.values.is_empty()
+            && count == Some(part.values.len())
     };
-    let rows = shapes.iter().map(|shape| shape.0).sum();
+    let rows = shapes.iter().map(|shape| shape.0).fold(0, usize::saturating_add);
     let all_fit = shapes.iter().zip(kernel.parts).all(|(shape, part)| fits(shape, part))
         && kernel.bias.is_none_or(|bias| bias.len() == rows)
         && (kernel.arrangement == Arrangement::Plain || rows % 2 == 0);
     match shapes.first() {
-        Some(&(_, inputs, side)) if all_fit && inputs > 0 && (side == 1 || side == 3) => {
+        Some(&(_, inputs, side)) if all_fit && (side == 1 || side == 3) => {
             Ok(Sizes { inputs, side, rows })
         }
         _ => Err(Error::Internal(format!(
@@ -350,3 +360,6 @@ fn permute<T: Pod + Send + Sync>(
         }
     });
 }
+
+#[cfg(test)]
+mod tests;

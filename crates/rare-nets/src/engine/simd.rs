@@ -14,6 +14,8 @@ mod avx512;
 mod neon;
 mod portable;
 
+use std::ffi::OsString;
+
 use half::{bf16, f16};
 use rare::{Error, Result};
 
@@ -113,8 +115,13 @@ impl Processor {
     /// # Errors
     /// `Unsupported` if the variable names instructions that this machine does not have.
     pub fn detect() -> Result<Processor> {
+        Processor::choose(std::env::var_os(OVERRIDE))
+    }
+
+    /// The best, or the one that is forced (by anything but an empty name).
+    fn choose(forced: Option<OsString>) -> Result<Processor> {
         let available = Processor::available();
-        let Some(forced) = std::env::var_os(OVERRIDE).filter(|name| !name.is_empty()) else {
+        let Some(forced) = forced.filter(|name| !name.is_empty()) else {
             return Ok(available.last().copied().unwrap_or(Processor(Level::Portable(Portable))));
         };
         let names = || available.iter().map(|one| one.name()).collect::<Vec<_>>().join(", ");
@@ -177,3 +184,6 @@ impl Processor {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

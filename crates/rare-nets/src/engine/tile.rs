@@ -199,3 +199,116 @@ unsafe fn place<'a>(start: *mut f32, row: usize, group: usize) -> &'a mut [f32; 
     // SAFETY: what the caller vouches for.
     unsafe { &mut *start.add(row + group * LANES).cast() }
 }
+
+#[cfg(test)]
+mod tests {
+    use half::bf16;
+
+    use super::{Segment, Tile};
+    use crate::engine::cpu::Precision;
+    use crate::engine::simd::{LANES, Processor};
+
+    /// Small integers, as one number or as a pair: their products and sums are exact.
+    fn units(count: usize, precision: Precision) -> Vec<f32> {
+        let number = |index: usize| (index * 7 % 17) as f32 - 8.0;
+        let bits = |index| u32::from(bf16::from_f32(number(index)).to_bits());
+        let unit = |index| match precision {
+            Precision::F32 => number(index),
+            Precision::Bf16 => f32::from_bits(bits(2 * index + 1) << 16 | bits(2 * index)),
+        };
+        (0..count).map(unit).collect()
+    }
+
+    fn product(a: f32, b: f32, precision: Precision) -> f32 {
+        let half = |unit: f32, shift: u32| f32::from_bits(unit.to_bits() >> shift << 16);
+        match precision {
+            Precision::F32 => a * b,
+            Precision::Bf16 => half(a, 0) * half(b, 0) + half(a, 16) * half(b, 16),
+        }
+    }
+
+    /// The product by its definition.
+    fn expected(tile: &Tile<'_>, precision: Precision, c: &mut [f32]) {
+        for (row, &start) in tile.rows.iter().enumerate() {
+            for column in 0..tile.groups * LANES {
+                let offsets = tile.segments.iter().flat_map(|s| s.offset..s.offset + s.steps);
+                let terms = offsets.enumerate().map(|(step, offset)| {
+                    let factor = tile.a[(start + offset) as usize];
+                    product(factor, tile.b[step * tile.b_stride + column], precision)
+                });
+                let sum = &mut c[row * tile.c_stride + column];
+                *sum = terms.sum::<f32>() + if tile.accumulate { *sum } else { 0.0 };
+            }
+        }
+    }
+
+    const SEGMENTS: [Segment; 3] = [
+        Segment { offset: 3, steps: 5 },
+        Segment { offset: 40, steps: 1 },
+        Segment { offset: 20, steps: 4 },
+    ];
+    const STEPS: usize = 10;
+
+    /// Where `count` rows begin, in no order.
+    fn rows(count: usize) -> Vec<u32> {
+        (0..count).map(|row| (row * 29 % 31 * 5) as u32).collect()
+    }
+
+    #[test]
+    fn any_number_of_rows_and_groups_is_multiplied() {
+        for precision in [Precision::F32, Precision::Bf16] {
+            let a = units(5 * 31 + 41, precision);
+            for (count, groups) in (0..31).flat_map(|rows| (1..8).map(move |g| (rows, g))) {
+                let (b_stride, c_stride) = (groups * LANES + 5, groups * LANES + 3);
+                let b = units(STEPS * b_stride, precision);
+                let rows = rows(count);
+                for (accumulate, segments) in [(false, &SEGMENTS[..]), (true, &SEGMENTS[1..])] {
+                    let tile = Tile {
+                        a: &a,
+                        rows: &rows,
+                        segments,
+                        b: &b,
+                        b_stride,
+                        c_stride,
+                        groups,
+                        accumulate,
+                    };
+                    // Beyond the columns of the product nothing may change.
+                    let before: Vec<f32> =
+                        (0..(count + 1) * c_stride).map(|at| at as f32).collect();
+                    let mut wanted = before.clone();
+                    expected(&tile, precision, &mut wanted);
+                    for processor in Processor::available() {
+                        let mut found = before.clone();
+                        tile.multiply(processor, precision, &mut found);
+                        assert!(found == wanted, "{count} rows, {groups} groups, {processor:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_does_not_fit_is_noticed() {
+        let (a, b, rows) = (vec![0.0; 46], vec![0.0; 9 * 40 + 32], [0, 5]);
+        let tile = Tile {
+            a: &a,
+            rows: &rows,
+            segments: &SEGMENTS,
+            b: &b,
+            b_stride: 40,
+            c_stride: 50,
+            groups: 2,
+            accumulate: false,
+        };
+        let c = vec![0.0; 50 + 32];
+        assert!(tile.fits(&c));
+        assert!(!tile.fits(&c[1..]));
+        assert!(!Tile { a: &a[1..], ..tile }.fits(&c));
+        assert!(!Tile { b: &b[1..], ..tile }.fits(&c));
+        assert!(!Tile { rows: &[6, 0], ..tile }.fits(&c));
+        assert!(!Tile { groups: 3, ..tile }.fits(&c));
+        assert!(!Tile { segments: &[], ..tile }.fits(&c));
+        assert!(!Tile { segments: &[Segment { offset: 0, steps: 11 }], ..tile }.fits(&c));
+    }
+}

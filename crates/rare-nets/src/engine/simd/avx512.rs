@@ -2,13 +2,13 @@
 #![allow(unsafe_code)]
 
 use core::arch::x86_64::{
-    __m512, _mm256_loadu_si256, _mm256_storeu_si256, _mm512_add_epi32, _mm512_add_ps,
-    _mm512_and_si512, _mm512_castps_si512, _mm512_castsi512_ps, _mm512_cvtepi32_epi16,
-    _mm512_cvtepu16_epi32, _mm512_cvtneps_pbh, _mm512_cvtph_ps, _mm512_div_ps, _mm512_dpbf16_ps,
-    _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_max_ps, _mm512_min_ps, _mm512_mul_ps,
-    _mm512_reduce_add_ps, _mm512_reduce_max_ps, _mm512_roundscale_ps, _mm512_scalef_ps,
-    _mm512_set1_epi32, _mm512_set1_ps, _mm512_slli_epi32, _mm512_srli_epi32, _mm512_storeu_ps,
-    _mm512_sub_ps,
+    __m256bh, __m256i, __m512, __m512bh, _mm256_loadu_si256, _mm256_storeu_si256, _mm512_add_epi32,
+    _mm512_add_ps, _mm512_and_si512, _mm512_castps_si512, _mm512_castsi512_ps,
+    _mm512_cvtepi32_epi16, _mm512_cvtepu16_epi32, _mm512_cvtneps_pbh, _mm512_cvtph_ps,
+    _mm512_div_ps, _mm512_dpbf16_ps, _mm512_fmadd_ps, _mm512_loadu_ps, _mm512_max_ps,
+    _mm512_min_ps, _mm512_mul_ps, _mm512_reduce_add_ps, _mm512_reduce_max_ps, _mm512_roundscale_ps,
+    _mm512_scalef_ps, _mm512_set1_epi32, _mm512_set1_ps, _mm512_slli_epi32, _mm512_srli_epi32,
+    _mm512_storeu_ps, _mm512_sub_ps,
 };
 use core::mem::transmute;
 
@@ -134,7 +134,7 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
         // SAFETY: see the implementation's comment.
         unsafe {
             let halves = if BF16 {
-                transmute::<_, core::arch::x86_64::__m256i>(_mm512_cvtneps_pbh(floats))
+                transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(floats))
             } else {
                 let bits = _mm512_castps_si512(floats);
                 let odd = _mm512_and_si512(_mm512_srli_epi32::<16>(bits), _mm512_set1_epi32(1));
@@ -192,7 +192,8 @@ impl<const BF16: bool> Simd for Avx512<BF16> {
         // SAFETY: see the implementation's comment; with `BF16` the token vouches for BF16 too.
         unsafe {
             if BF16 {
-                return _mm512_dpbf16_ps(sum, transmute(a), transmute(b));
+                let (a, b) = (transmute::<__m512, __m512bh>(a), transmute::<__m512, __m512bh>(b));
+                return _mm512_dpbf16_ps(sum, a, b);
             }
             let ((a_high, a_low), (b_high, b_low)) = (pairs(a), pairs(b));
             _mm512_fmadd_ps(a_high, b_high, _mm512_fmadd_ps(a_low, b_low, sum))
