@@ -1,12 +1,17 @@
 //! What was typed.
 
+mod weights;
+
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
 use rare::InitialMethod;
 use serde::Serialize;
 
+#[cfg(feature = "fetch")]
+pub(crate) use self::weights::FetchArgs;
+pub(crate) use self::weights::{CheckArgs, WeightsArgs, WeightsCommand};
 use crate::options::{Options, choice};
 
 const EXAMPLES: &str = "\
@@ -39,6 +44,17 @@ Examples:
 Feature files are NPZ archives of `points` (N x 3, metres) and `features` (N x D).
 Correspondences are `source` and `reference` (N x 3, metres) and optionally `score` (N).";
 
+const FEATURES_EXAMPLES: &str = "\
+Examples:
+  rare features scan1.ply scan2.ply --init coarse.txt --output pair.npz
+  rare refine scan1.ply scan2.ply --init coarse.txt --depth-features pair.npz
+  rare features scan1.ply --output scan1.npz --encoder diffusion --weights sd15
+  rare features scan1.ply --output scan1.npz --camera overlap
+
+Of a pair, the features of all depth maps under the initial transform are written, for --depth-features.
+Of one cloud, the features of its own depth maps are written at the points that they show: `points` (N x 3, metres)
+and `features` (N x D), for --source-features and --reference-features.";
+
 /// Register point clouds and refine given registrations, with a verdict on the result
 #[derive(Debug, Parser)]
 #[command(name = "rare", version, after_help = EXAMPLES)]
@@ -53,12 +69,16 @@ pub(crate) enum Command {
     Register(RegisterArgs),
     /// Refine a given transform between two clouds
     Refine(RefineArgs),
+    /// Write the dense features of the depth maps of a pair, or of one cloud at its points
+    Features(FeaturesArgs),
     /// Say what is in cloud files, and which lengths would be used for them
     Info(InfoArgs),
     /// Write a cloud in another format
     Convert(ConvertArgs),
     /// Simulate two scans of a room, register them from a wrong start and compare with the truth
     Demo(DemoArgs),
+    /// Get and check the weights of the diffusion features
+    Weights(WeightsArgs),
     /// Print the completion script of a shell
     Completions(CompletionsArgs),
 }
@@ -115,6 +135,35 @@ pub(crate) struct Start {
     /// Correspondences of another method (NPZ) in the place of matches of 3D features
     #[arg(long, value_name = "FILE", conflicts_with = "source_features")]
     pub(crate) correspondences: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+#[command(after_help = FEATURES_EXAMPLES)]
+pub(crate) struct FeaturesArgs {
+    /// The cloud, or the source of a pair (.ply .pcd .xyz .npy .npz .bin .las .laz .e57; metres)
+    #[arg(value_name = "SRC")]
+    pub(crate) source: PathBuf,
+    /// The reference of a pair
+    #[arg(value_name = "REF", requires = "init")]
+    pub(crate) reference: Option<PathBuf>,
+    /// The initial transform of the pair, in the formats of `rare refine`
+    #[arg(long, value_name = "FILE", requires = "reference")]
+    pub(crate) init: Option<PathBuf>,
+    /// The direction in which the file holds it
+    #[arg(long, value_name = "DIRECTION", value_enum, default_value_t = Direction::SourceToTarget)]
+    pub(crate) init_direction: Direction,
+    #[command(flatten)]
+    pub(crate) options: Options,
+}
+
+/// The command line. `features` has the options of the commands that register, but writes one file of its own.
+pub(crate) fn command() -> clap::Command {
+    Cli::command().mut_subcommand("features", |features| {
+        ["json", "save_aligned", "depth_features", "verbose"]
+            .into_iter()
+            .fold(features, |features, option| features.mut_arg(option, |arg| arg.hide(true)))
+            .mut_arg("output", |output| output.help("Write the features (NPZ)"))
+    })
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]

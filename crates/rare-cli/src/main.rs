@@ -6,16 +6,19 @@
 #![forbid(unsafe_code)]
 
 mod args;
+mod memory;
+mod network;
 mod options;
 mod outputs;
 mod progress;
 mod record;
 mod run;
+mod speed;
 mod summary;
 
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::FromArgMatches;
 
 use crate::args::Cli;
 
@@ -27,7 +30,8 @@ const NO_POSE: u8 = 1;
 const BAD_INPUT: u8 = 2;
 
 fn main() -> ExitCode {
-    let code = run::run(Cli::parse()).unwrap_or_else(|error| {
+    let typed = Cli::from_arg_matches(&args::command().get_matches());
+    let code = run::run(typed.unwrap_or_else(|error| error.exit())).unwrap_or_else(|error| {
         summary::say(&format!("error: {error:#}"));
         code_of(&error)
     });

@@ -1,7 +1,9 @@
-//! The options that `register` and `refine` share: one struct for flags and for the configuration file.
+//! The options that `register`, `refine` and `features` share: one struct for flags and for the configuration file.
 //!
 //! A flag wins over the file, the file over the default. [`Options::resolve`] decides everything that is left open, so
 //! that nothing else in the program has to know a default.
+
+mod diffusion;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,6 +11,8 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
+pub(crate) use diffusion::Diffusion;
+use diffusion::DiffusionOptions;
 use rare::scale::Profile;
 use rare::viewpoints::CameraChoice;
 use rare::{InitialMethod, Recipe, RefinerConfig};
@@ -20,7 +24,7 @@ use serde::{Deserialize, Serialize};
 #[serde(default, deny_unknown_fields, rename_all = "kebab-case")]
 pub(crate) struct Options {
     /// Write the transform (source -> reference) as 4 lines of 4 numbers
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, alias = "out", value_name = "FILE")]
     pub(crate) output: Option<PathBuf>,
     /// Write the transform with all evidence and settings as JSON
     #[arg(long, value_name = "FILE")]
@@ -43,11 +47,15 @@ pub(crate) struct Options {
     #[arg(long, value_name = "METRES", allow_negative_numbers = true)]
     pub(crate) voxel: Option<f64>,
     /// Where the features of depth maps come from [default: builtin; with --depth-features: recorded]
-    #[arg(long, value_name = "ENCODER", value_parser = choice::<Encoder>(&["builtin", "recorded"]))]
+    #[arg(long, value_name = "ENCODER", value_parser = choice::<Encoder>(&["builtin", "recorded", "diffusion"]))]
     pub(crate) encoder: Option<Encoder>,
     /// Recorded features of the depth maps (NPZ), made under the very same initial transform; `refine` only
     #[arg(long, value_name = "FILE")]
     pub(crate) depth_features: Option<PathBuf>,
+    /// How often the clouds are looked at and matched, each time under the transform found before [default: 2; with
+    /// --preset paper or --encoder recorded: 1]
+    #[arg(long, value_name = "N")]
+    pub(crate) rounds: Option<usize>,
     /// A flag of `register` alone; here so that one file serves both commands.
     #[arg(skip)]
     pub(crate) init_method: Option<InitialMethod>,
@@ -67,6 +75,8 @@ pub(crate) struct Options {
     #[arg(long, value_name = "FILE.toml")]
     #[serde(skip)]
     pub(crate) config: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) diffusion: DiffusionOptions,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -82,6 +92,7 @@ pub(crate) enum Preset {
 pub(crate) enum Encoder {
     Builtin,
     Recorded,
+    Diffusion,
 }
 
 /// The options with nothing left open.
@@ -89,8 +100,12 @@ pub(crate) enum Encoder {
 pub(crate) struct Settings {
     pub(crate) preset: Preset,
     pub(crate) refiner: RefinerConfig,
-    /// Recorded features of the depth maps; without them the built-in features are used.
+    /// Where the features of depth maps come from.
+    pub(crate) encoder: Encoder,
+    /// The file of `Encoder::Recorded`.
     pub(crate) depth_features: Option<PathBuf>,
+    /// The settings of `Encoder::Diffusion`.
+    pub(crate) diffusion: Option<Diffusion>,
     pub(crate) init_method: InitialMethod,
     /// 0: as many as there are cores.
     pub(crate) threads: usize,
@@ -119,6 +134,7 @@ impl Options {
     /// # Errors
     /// If the file cannot be read or has an unknown key, or if options contradict each other.
     pub(crate) fn resolve(self) -> Result<Settings> {
+        let diffusion_named = self.diffusion != DiffusionOptions::default();
         let options = match &self.config {
             Some(file) => {
                 let from_file = Options::read(file)?;
@@ -126,19 +142,36 @@ impl Options {
             }
             None => self,
         };
-        let recorded = options.recorded()?;
+        let encoder = options.encoder()?;
+        if diffusion_named && encoder != Encoder::Diffusion {
+            bail!(
+                "options of diffusion features are given, but not asked for: add --encoder diffusion"
+            );
+        }
+        options.settings(encoder)
+    }
+
+    fn settings(self, encoder: Encoder) -> Result<Settings> {
+        let refiner = self.refiner(encoder)?;
+        let paper = self.preset == Some(Preset::Paper);
+        let diffusion = match encoder {
+            Encoder::Diffusion => Some(self.diffusion.resolve(paper, refiner.seed)?),
+            Encoder::Builtin | Encoder::Recorded => None,
+        };
         Ok(Settings {
-            preset: options.preset.unwrap_or_default(),
-            refiner: options.refiner(recorded),
-            depth_features: options.depth_features.filter(|_| recorded),
-            init_method: options.init_method.unwrap_or_default(),
-            threads: options.threads.unwrap_or(0),
-            quiet: options.quiet.unwrap_or(false),
-            verbose: options.verbose.unwrap_or(false),
-            output: options.output,
-            json: options.json,
-            save_aligned: options.save_aligned,
-            config: options.config,
+            preset: self.preset.unwrap_or_default(),
+            refiner,
+            encoder,
+            depth_features: self.depth_features.filter(|_| encoder == Encoder::Recorded),
+            diffusion,
+            init_method: self.init_method.unwrap_or_default(),
+            threads: self.threads.unwrap_or(0),
+            quiet: self.quiet.unwrap_or(false),
+            verbose: self.verbose.unwrap_or(false),
+            output: self.output,
+            json: self.json,
+            save_aligned: self.save_aligned,
+            config: self.config,
         })
     }
 
@@ -164,50 +197,69 @@ impl Options {
             voxel: self.voxel.or(other.voxel),
             encoder: self.encoder.or(other.encoder),
             depth_features: self.depth_features.or(other.depth_features),
+            rounds: self.rounds.or(other.rounds),
             init_method: self.init_method.or(other.init_method),
             seed: self.seed.or(other.seed),
             threads: self.threads.or(other.threads),
             quiet: self.quiet.or(other.quiet),
             verbose: self.verbose.or(other.verbose),
             config: self.config.or(other.config),
+            diffusion: self.diffusion.or(other.diffusion),
         }
     }
 
-    /// Whether recorded features are used.
-    fn recorded(&self) -> Result<bool> {
+    /// Where the features of depth maps come from.
+    fn encoder(&self) -> Result<Encoder> {
         match (self.encoder, &self.depth_features) {
-            (Some(Encoder::Builtin), Some(file)) => bail!(
-                "--encoder builtin does not use --depth-features {}: leave out one of them",
+            (Some(encoder @ (Encoder::Builtin | Encoder::Diffusion)), Some(file)) => bail!(
+                "--encoder {} does not use --depth-features {}: leave out one of them",
+                encoder.name(),
                 file.display()
             ),
             (Some(Encoder::Recorded), None) => {
                 bail!("--encoder recorded needs the recorded features: add --depth-features FILE")
             }
-            (_, file) => Ok(file.is_some()),
+            (None, Some(_)) => Ok(Encoder::Recorded),
+            (encoder, _) => Ok(encoder.unwrap_or(Encoder::Builtin)),
         }
     }
 
-    fn refiner(&self, recorded: bool) -> RefinerConfig {
+    fn refiner(&self, encoder: Encoder) -> Result<RefinerConfig> {
         let paper = self.preset == Some(Preset::Paper);
-        let mut recipe = if paper { Recipe::paper() } else { Recipe::default() };
-        if recorded {
+        let recipe = if paper { Recipe::paper() } else { Recipe::default() };
+        let recipe = match encoder {
+            Encoder::Builtin => recipe,
             // The features belong to the views under the initial transform, a second round has others.
-            recipe.rounds = 1;
-        }
-        let profile = self.profile.unwrap_or_default();
-        RefinerConfig {
-            profile,
+            Encoder::Recorded => Recipe { rounds: 1, ..recipe },
+            Encoder::Diffusion => recipe.for_network(),
+        };
+        Ok(RefinerConfig {
+            profile: self.profile.unwrap_or_default(),
             camera: self.camera.unwrap_or_default(),
             voxel: self.voxel,
             seed: self.seed.unwrap_or(0),
-            recipe,
+            recipe: Recipe { rounds: self.rounds(encoder, recipe.rounds)?, ..recipe },
+        })
+    }
+
+    fn rounds(&self, encoder: Encoder, default: usize) -> Result<usize> {
+        match self.rounds {
+            Some(0) => bail!("--rounds 0: at least one is needed to look at the clouds"),
+            Some(rounds @ 2..) if encoder == Encoder::Recorded => bail!(
+                "--rounds {rounds}: recorded features belong to the views of one round: leave it out"
+            ),
+            rounds => Ok(rounds.unwrap_or(default)),
         }
     }
 }
 
-impl Settings {
-    /// Where the features of depth maps come from.
-    pub(crate) fn encoder(&self) -> Encoder {
-        if self.depth_features.is_some() { Encoder::Recorded } else { Encoder::Builtin }
+impl Encoder {
+    /// The name that options have for it.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Encoder::Builtin => "builtin",
+            Encoder::Recorded => "recorded",
+            Encoder::Diffusion => "diffusion",
+        }
     }
 }

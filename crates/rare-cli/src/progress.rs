@@ -1,20 +1,28 @@
-//! A sign of life on a terminal while something takes long.
+//! A sign of life while something takes long: on a terminal a spinner, or a bar where passes can be counted; elsewhere a
+//! line now and then, where it takes minutes.
 
 use std::io::{self, IsTerminal};
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressDrawTarget};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use crate::summary;
 
 /// Work that takes less shows nothing.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// How often the spinner turns.
 const TURN: Duration = Duration::from_millis(100);
+/// How often a line is written where there is no terminal.
+const LINE: Duration = Duration::from_secs(15);
 
 /// Names the current step beside a spinner until it is dropped.
 pub(crate) struct Progress {
     spinner: ProgressBar,
+    /// Whether lines are written, as there is somebody to read them and no terminal.
+    lines: bool,
     /// Waits for [`PATIENCE`] to pass or the sender to be dropped, whichever is first.
     waiting: Option<(Sender<()>, JoinHandle<()>)>,
 }
@@ -24,7 +32,8 @@ impl Progress {
     pub(crate) fn start(quiet: bool) -> Progress {
         let spinner = ProgressBar::new_spinner();
         spinner.set_draw_target(ProgressDrawTarget::hidden());
-        let shown = !quiet && io::stderr().is_terminal();
+        let terminal = io::stderr().is_terminal();
+        let shown = !quiet && terminal;
         let waiting = shown.then(|| {
             let (sender, receiver) = mpsc::channel();
             let spinner = spinner.clone();
@@ -36,7 +45,7 @@ impl Progress {
             });
             (sender, thread)
         });
-        Progress { spinner, waiting }
+        Progress { spinner, lines: !quiet && !terminal, waiting }
     }
 
     /// Says what is being done.
@@ -48,6 +57,64 @@ impl Progress {
     pub(crate) fn callback(&self) -> impl Fn(&'static str) + Send + Sync + 'static {
         let spinner = self.spinner.clone();
         move |step| spinner.set_message(step)
+    }
+}
+
+impl Progress {
+    /// Where passes are counted.
+    pub(crate) fn passes(&self) -> Passes {
+        Passes { bar: self.spinner.clone(), lines: self.lines.then(Mutex::default) }
+    }
+}
+
+/// Counts the passes of the maps through the networks.
+pub(crate) struct Passes {
+    bar: ProgressBar,
+    /// If lines are written: when counting began, and when the last line was written.
+    lines: Option<Mutex<Option<[Instant; 2]>>>,
+}
+
+impl Passes {
+    /// Begins to count to `total`.
+    pub(crate) fn begin(&self, total: usize) {
+        const BAR: &str = "{spinner} {msg} {wide_bar} {pos} of {len} passes, {eta} left";
+        if let Ok(style) = ProgressStyle::with_template(BAR) {
+            self.bar.set_style(style);
+        }
+        self.bar.set_length(total as u64);
+        self.bar.set_position(0);
+        self.bar.reset_eta();
+        if let Some(lines) = &self.lines {
+            *lock(lines) = Some([Instant::now(); 2]);
+        }
+    }
+
+    /// So many are done, of so many.
+    pub(crate) fn show(&self, done: usize, total: usize) {
+        self.bar.set_position(done as u64);
+        let Some(lines) = &self.lines else { return };
+        let mut lines = lock(lines);
+        let Some([begun, last]) = &mut *lines else { return };
+        if last.elapsed() >= LINE {
+            *last = Instant::now();
+            let left = total.saturating_sub(done) as f64 / done.max(1) as f64;
+            let left = duration_in_words(begun.elapsed().as_secs_f64() * left);
+            summary::say(&format!("{done} of {total} passes, {left} left"));
+        }
+    }
+}
+
+/// What is inside, whatever happened to those who had it.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// A time that is only an estimate, in seconds, minutes or hours.
+pub(crate) fn duration_in_words(seconds: f64) -> String {
+    match seconds {
+        ..100.0 => format!("{seconds:.0} s"),
+        ..6000.0 => format!("{:.0} min", seconds / 60.0),
+        _ => format!("{:.1} h", seconds / 3600.0),
     }
 }
 

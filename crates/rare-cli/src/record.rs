@@ -10,7 +10,8 @@ use rare::viewpoints::CameraChoice;
 use rare::{Recipe, RigidTransform};
 use serde::{Serialize, Serializer};
 
-use crate::options::{Encoder, Preset};
+use crate::network::NetworkRecord;
+use crate::options::{Encoder, Preset, Settings};
 use crate::run::{Inputs, Registration};
 
 type Matrix<const N: usize> = [[f64; N]; N];
@@ -54,9 +55,25 @@ struct Config<'a> {
     encoder: Encoder,
     #[serde(skip_serializing_if = "Option::is_none")]
     depth_features: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    diffusion: Option<&'a NetworkRecord>,
     threads: usize,
     recipe: &'a Recipe,
     scale: Scale,
+}
+
+/// What made features.
+#[derive(Serialize)]
+struct Features {
+    encoder: Encoder,
+    preset: Preset,
+    profile: Profile,
+    camera: CameraChoice,
+    voxel: Option<f64>,
+    seed: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    diffusion: Option<NetworkRecord>,
+    version: &'static str,
 }
 
 /// Seconds by step, in the order of the steps.
@@ -106,6 +123,24 @@ pub(crate) fn to_json(registration: &Registration) -> Result<String> {
     Ok(serde_json::to_string_pretty(&record)? + "\n")
 }
 
+/// The settings that made features, which are kept with them.
+pub(crate) fn features_to_json(
+    settings: &Settings,
+    network: Option<NetworkRecord>,
+) -> Result<String> {
+    let features = Features {
+        encoder: settings.encoder,
+        preset: settings.preset,
+        profile: settings.refiner.profile,
+        camera: settings.refiner.camera,
+        voxel: settings.refiner.voxel,
+        seed: settings.refiner.seed,
+        diffusion: network,
+        version: env!("CARGO_PKG_VERSION"),
+    };
+    Ok(serde_json::to_string_pretty(&features)? + "\n")
+}
+
 fn config(registration: &Registration) -> Config<'_> {
     let (settings, scale) = (&registration.settings, registration.refinement.scale);
     Config {
@@ -115,8 +150,9 @@ fn config(registration: &Registration) -> Config<'_> {
         camera: chosen_camera(settings.refiner.camera, scale.kind, &settings.refiner.recipe),
         voxel: scale.voxel,
         seed: settings.refiner.seed,
-        encoder: settings.encoder(),
+        encoder: settings.encoder,
         depth_features: settings.depth_features.as_ref().map(|file| file.display().to_string()),
+        diffusion: registration.network.as_ref(),
         threads: rayon::current_num_threads(),
         recipe: &settings.refiner.recipe,
         scale,

@@ -4,14 +4,18 @@
 //! |---|---|
 //! | [`engine`] | tensors, operations of fused size, kernels for each processor |
 //! | [`checkpoint`] | weight files, read without executing anything |
+//! | [`cache`] | features that were computed before |
 //! | [`diffusion`] | Stable Diffusion 1.5 with a depth `ControlNet`: features of depth maps |
+//! | [`weights`] | where weight files come from, and whether they are intact |
 //!
 //! The networks are written once, generic over [`engine::Backend`]; the geometry that uses their features is in the
 //! crate `rare`.
 
+pub mod cache;
 pub mod checkpoint;
 pub mod diffusion;
 pub mod engine;
 mod parameter;
+pub mod weights;
 
 pub use parameter::{Parameter, Values};

@@ -86,10 +86,10 @@ impl DepthFeatures {
 }
 
 impl DepthEncoder for DepthFeatures {
-    fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>> {
         self.validate()?;
         let cosines = Cosines::new(self.lattice, self.frequencies);
-        maps.par_iter().map(|map| Ok(vec![self.describe(map, &cosines)?])).collect()
+        maps.par_iter().map(|(_, map)| Ok(vec![self.describe(map, &cosines)?])).collect()
     }
 }
 

@@ -48,4 +48,4 @@ pub use data::{
 };
 pub use error::{Error, Result};
 pub use nalgebra;
-pub use refine::{InitialMethod, Recipe, Refinement, Refiner, RefinerConfig};
+pub use refine::{EncodedViews, InitialMethod, Recipe, Refinement, Refiner, RefinerConfig};

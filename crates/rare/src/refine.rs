@@ -1,6 +1,7 @@
 //! The arrows of the paper's figure: which step follows which. Nothing else in the crate knows the order.
 
 mod config;
+mod encoded_views;
 mod hypotheses;
 mod initial;
 mod stopwatch;
@@ -10,6 +11,8 @@ mod working_pair;
 use nalgebra::Matrix6;
 
 pub use config::{Recipe, RefinerConfig};
+use encoded_views::DenseViews;
+pub use encoded_views::EncodedViews;
 use hypotheses::Candidate;
 pub use initial::InitialMethod;
 use stopwatch::Stopwatch;
@@ -18,17 +21,13 @@ use working_pair::WorkingPair;
 
 use crate::aggregate::vote;
 use crate::data::{
-    Correspondence, CorrespondenceSet, CorrespondenceSets, DepthMap, LayeredFeatures,
-    RigidTransform, Scan, SetName,
+    Correspondence, CorrespondenceSet, CorrespondenceSets, RigidTransform, Scan, SetName,
 };
-use crate::densify::Densifier;
-use crate::depth_features::DepthFeatures;
 use crate::encode::DepthEncoder;
 use crate::error::Result;
-use crate::scale::{Scale, SceneKind};
+use crate::scale::Scale;
 use crate::transfer::Sampling;
 use crate::verify::{DepthConsistency, Verdict, Verifier, confidence};
-use crate::viewpoints::{self, CameraChoice, Viewpoint};
 
 /// Refines initial transforms between clouds.
 ///
@@ -217,13 +216,11 @@ impl Refiner {
         clock: &mut Stopwatch<'_>,
     ) -> Result<CorrespondenceSets> {
         let recipe = &self.config.recipe;
-        let viewpoints = self.viewpoints(pair, pose);
-        let sparse = clock.time("project", || views::project_all(pair, &viewpoints, pose));
-        let dense = clock.time("densify", || views::densify_all(&sparse, self.densifier(pair)));
-        let layers = clock.time("encode", || self.encode(pair, &dense))?;
+        let DenseViews { viewpoints, maps } = self.dense_views(pair, pose, clock);
+        let layers = clock.time("encode", || self.encode(pair, &maps))?;
         let features = clock.time("reduce", || views::reduce_all(layers, recipe.components))?;
         let lifted = clock.time("transfer", || {
-            views::transfer_all(pair, &viewpoints, pose, &dense, &features, self.sampling())
+            views::transfer_all(pair, &viewpoints, pose, &maps, &features, self.sampling())
         });
         let fused = clock.time("fuse", || views::fuse_all(pair, &lifted));
         clock.time("match", || views::match_all(pair, &viewpoints, &lifted, &fused, given))
@@ -255,19 +252,6 @@ impl Refiner {
         clock.time("polish", || hypotheses::polish(pair, &ranked, verifier))
     }
 
-    /// The paper sees a street through KITTI's colour camera; everything else chooses by the kind of scene.
-    fn viewpoints(&self, pair: &WorkingPair<'_>, pose: &RigidTransform) -> Vec<Viewpoint> {
-        let camera = match self.config.camera {
-            CameraChoice::Auto if self.is_street_in_metres(pair) => CameraChoice::Kitti,
-            chosen => chosen,
-        };
-        viewpoints::choose(camera, &pair.scale, &pair.target.coarse, &pair.source.coarse, pose)
-    }
-
-    fn is_street_in_metres(&self, pair: &WorkingPair<'_>) -> bool {
-        self.config.recipe.metric && pair.scale.kind == SceneKind::Lidar
-    }
-
     fn verifier<'a>(&self, pair: &'a WorkingPair<'_>, pose: &RigidTransform) -> Verifier<'a> {
         Verifier::new(
             &pair.target.fine,
@@ -275,18 +259,6 @@ impl Refiner {
             &self.viewpoints(pair, pose),
             pair.scale.voxel,
         )
-    }
-
-    /// The recipe's filters: `fast` indoors and in working units, `multiscale` for streets in metres.
-    fn densifier(&self, pair: &WorkingPair<'_>) -> Densifier {
-        if self.is_street_in_metres(pair) { Densifier::Multiscale } else { Densifier::Fast }
-    }
-
-    fn encode(&self, pair: &WorkingPair<'_>, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
-        match &self.encoder {
-            Some(encoder) => encoder.encode(maps),
-            None => DepthFeatures::for_voxel(pair.scale.voxel).encode(maps),
-        }
     }
 
     fn sampling(&self) -> Sampling {

@@ -3,9 +3,11 @@
 mod completions;
 mod convert;
 mod demo;
+mod features;
 mod info;
 mod refine;
 mod register;
+mod weights;
 
 use std::io::{self, ErrorKind, Write};
 use std::path::Path;
@@ -16,6 +18,7 @@ use rare::{InitialMethod, Refinement, RigidTransform, Scan, io as files};
 use serde::Serialize;
 
 use crate::args::{Cli, Clouds, Command, Direction};
+use crate::network::NetworkRecord;
 use crate::options::Settings;
 use crate::outputs::{self, Output};
 use crate::{NO_POSE, SUCCESS, record, summary};
@@ -25,9 +28,11 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
     match cli.command {
         Command::Register(args) => register::run(args),
         Command::Refine(args) => refine::run(args),
+        Command::Features(args) => features::run(args),
         Command::Info(args) => info::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Demo(args) => demo::run(&args),
+        Command::Weights(args) => weights::run(args),
         Command::Completions(args) => completions::run(&args),
     }
 }
@@ -41,6 +46,8 @@ pub(crate) struct Registration {
     /// The transform that was given, source to reference.
     pub(crate) initial: Option<RigidTransform>,
     pub(crate) refinement: Refinement,
+    /// The networks that were used.
+    pub(crate) network: Option<NetworkRecord>,
     pub(crate) read_seconds: f64,
     pub(crate) total_seconds: f64,
 }

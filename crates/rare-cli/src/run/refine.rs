@@ -4,9 +4,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result};
+use rare::encode::Recorded;
 use rare::{Correspondence, Refinement, Refiner, RigidTransform, Scan, io as files};
 
 use crate::args::{Clouds, Direction, RefineArgs, Start};
+use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::Settings;
 use crate::progress::Progress;
 use crate::run::{Inputs, Registration, check_outputs, read_scan, start_threads, which};
@@ -34,21 +36,29 @@ struct Problem {
     reference: Scan,
     initial: RigidTransform,
     correspondences: Option<Vec<Correspondence>>,
-    refiner: Refiner,
+    recorded: Option<Recorded>,
+    pipeline: Option<OpenPipeline>,
 }
 
 pub(super) fn registration(
     clouds: &Clouds,
     start: &Start,
-    settings: Settings,
+    mut settings: Settings,
 ) -> Result<Registration> {
     let clock = Instant::now();
     let progress = Progress::start(settings.quiet);
     progress.step("read");
-    let mut problem = read(clouds, start, &settings)?;
+    let mut problem = read(clouds, start, &mut settings)?;
     let read_seconds = clock.elapsed().as_secs_f64();
-    problem.refiner = problem.refiner.with_progress(progress.callback());
-    let refinement = problem.solve().with_context(|| which(clouds))?;
+    let clouds_read = [&problem.source, &problem.reference];
+    let (refiner, network) =
+        network::refiner(problem.pipeline.take(), clouds_read, &settings, &progress)?;
+    let refiner = match problem.recorded.take() {
+        Some(recorded) => refiner.with_encoder(Box::new(recorded)),
+        None => refiner,
+    };
+    let mut refinement = problem.solve(&refiner).with_context(|| which(clouds))?;
+    refinement.warnings.extend(network.iter().flat_map(NetworkEncoder::warnings));
     Ok(Registration {
         settings,
         inputs: named(clouds, start),
@@ -56,20 +66,17 @@ pub(super) fn registration(
         reference: problem.reference,
         initial: Some(problem.initial),
         refinement,
+        network: network.as_ref().map(NetworkEncoder::record),
         read_seconds,
         total_seconds: clock.elapsed().as_secs_f64(),
     })
 }
 
-fn read(clouds: &Clouds, start: &Start, settings: &Settings) -> Result<Problem> {
+fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Problem> {
     // The small files first: what is wrong with them need not wait for the clouds.
-    let initial = read_initial(start)?;
-    let mut refiner = Refiner::new(settings.refiner.clone());
-    if let Some(file) = &settings.depth_features {
-        let recorded = files::read_depth_features(file)?;
-        recorded.check_initial(&initial).with_context(|| file.display().to_string())?;
-        refiner = refiner.with_encoder(Box::new(recorded));
-    }
+    let initial = read_initial(&start.init, start.init_direction)?;
+    let recorded = read_recorded(settings, &initial)?;
+    let pipeline = OpenPipeline::of(settings)?;
     let features = |file: &Option<PathBuf>| -> rare::Result<_> {
         file.as_ref().map(files::read_point_features).transpose()
     };
@@ -82,25 +89,35 @@ fn read(clouds: &Clouds, start: &Start, settings: &Settings) -> Result<Problem> 
         reference: Scan { features: reference_features, ..read_scan(&clouds.reference)? },
         initial,
         correspondences,
-        refiner,
+        recorded,
+        pipeline,
     })
 }
 
+/// Recorded features, if they are asked for; they have their say in the recipe.
+fn read_recorded(settings: &mut Settings, initial: &RigidTransform) -> Result<Option<Recorded>> {
+    let Some(file) = &settings.depth_features else { return Ok(None) };
+    let recorded = files::read_depth_features(file)?;
+    recorded.check_initial(initial).with_context(|| file.display().to_string())?;
+    settings.refiner.recipe = settings.refiner.recipe.clone().for_recorded(&recorded);
+    Ok(Some(recorded))
+}
+
 /// The initial transform from source to reference.
-fn read_initial(start: &Start) -> Result<RigidTransform> {
-    let given = files::read_pose(&start.init)?;
-    Ok(match start.init_direction {
+pub(super) fn read_initial(init: &Path, direction: Direction) -> Result<RigidTransform> {
+    let given = files::read_pose(init)?;
+    Ok(match direction {
         Direction::SourceToTarget => given,
         Direction::TargetToSource => given.inverse(),
     })
 }
 
 impl Problem {
-    fn solve(&self) -> rare::Result<Refinement> {
+    fn solve(&self, refiner: &Refiner) -> rare::Result<Refinement> {
         let Problem { source, reference, initial, .. } = self;
         match &self.correspondences {
-            Some(pairs) => self.refiner.refine_matched(source, reference, initial, pairs),
-            None => self.refiner.refine(source, reference, initial),
+            Some(pairs) => refiner.refine_matched(source, reference, initial, pairs),
+            None => refiner.refine(source, reference, initial),
         }
     }
 }

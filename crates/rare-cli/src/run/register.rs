@@ -3,9 +3,9 @@
 use std::time::Instant;
 
 use anyhow::{Context, Result, bail};
-use rare::Refiner;
 
 use crate::args::{Clouds, RegisterArgs};
+use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::{Options, Settings};
 use crate::progress::Progress;
 use crate::run::{Inputs, Registration, Start, check_outputs, read_scan, start_threads, which};
@@ -28,12 +28,15 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
     let clock = Instant::now();
     let progress = Progress::start(settings.quiet);
     progress.step("read");
+    let pipeline = OpenPipeline::of(&settings)?;
     let (source, reference) = (read_scan(&clouds.source)?, read_scan(&clouds.reference)?);
     let read_seconds = clock.elapsed().as_secs_f64();
-    let refinement = Refiner::new(settings.refiner.clone())
-        .with_progress(progress.callback())
+    let (refiner, network) =
+        network::refiner(pipeline, [&source, &reference], &settings, &progress)?;
+    let mut refinement = refiner
         .register(&source, &reference, settings.init_method)
         .with_context(|| which(clouds))?;
+    refinement.warnings.extend(network.iter().flat_map(NetworkEncoder::warnings));
     let inputs = Inputs {
         source: clouds.source.display().to_string(),
         reference: clouds.reference.display().to_string(),
@@ -47,6 +50,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
         reference,
         initial: None,
         refinement,
+        network: network.as_ref().map(NetworkEncoder::record),
         read_seconds,
         total_seconds,
     })

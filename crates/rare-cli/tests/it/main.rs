@@ -1,10 +1,18 @@
 //! The program as its users see it: files in, files, exit codes and messages out.
-#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
+#![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking")]
 
 mod bad_input;
 mod commands;
+mod diffusion;
+mod features;
 mod options;
 mod outputs;
 mod readme;
 mod registration;
 mod shared;
+#[cfg(feature = "fetch")]
+mod weights;
+#[cfg(feature = "fetch")]
+#[path = "../../../rare-nets/tests/it/weights_server.rs"]
+#[expect(dead_code, reason = "shared with the tests of the library, which make more mistakes")]
+mod weights_server;

@@ -90,13 +90,24 @@ impl<B: Backend> DiffusionEncoder<B> {
     }
 }
 
+/// Depth images of one size.
+#[derive(Default)]
+struct Batch {
+    /// Where each stands among those that were asked for.
+    places: Vec<usize>,
+    /// With the numbers of their maps.
+    images: Vec<(usize, GrayImage)>,
+}
+
 impl<B: Backend> DepthEncoder for DiffusionEncoder<B> {
     /// Map `i` is that of cloud `i mod 2` in view `i / 2`, which decides its noise. Maps of any sizes may be mixed.
-    fn encode(&self, maps: &[DepthMap]) -> Result<Vec<LayeredFeatures>> {
-        let mut batches: BTreeMap<(usize, usize), Vec<(usize, GrayImage)>> = BTreeMap::new();
-        for (index, map) in maps.iter().enumerate() {
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> Result<Vec<LayeredFeatures>> {
+        let mut batches: BTreeMap<(usize, usize), Batch> = BTreeMap::new();
+        for (place, &(index, map)) in maps.iter().enumerate() {
             let image = hint(map, self.settings.holes)?;
-            batches.entry((image.height(), image.width())).or_default().push((index, image));
+            let batch = batches.entry((image.height(), image.width())).or_default();
+            batch.places.push(place);
+            batch.images.push((index, image));
         }
         let total = maps.len() * self.plan().passes();
         let done = AtomicUsize::new(0);
@@ -107,9 +118,9 @@ impl<B: Backend> DepthEncoder for DiffusionEncoder<B> {
             }
         };
         let mut encoded = BTreeMap::new();
-        for images in batches.into_values() {
+        for Batch { places, images } in batches.into_values() {
             let features = self.encode_batch(&images, report)?;
-            encoded.extend(images.iter().map(|&(index, _)| index).zip(features));
+            encoded.extend(places.into_iter().zip(features));
         }
         Ok(encoded.into_values().collect())
     }

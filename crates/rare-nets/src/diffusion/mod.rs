@@ -25,12 +25,14 @@ pub use cost::{
 };
 pub use encoder::DiffusionEncoder;
 pub use layers::{Contexts, Timestep};
+pub(crate) use layout::require;
 pub use layout::{
     Differences, Layout, Misshapen, compare, controlnet_layout, text_encoder_layout, unet_layout,
 };
 pub use noise::Noise;
 pub use pipeline::{Pipeline, TokenizerFiles};
 pub use sampler::{Hints, Networks, Plan, Prediction, Sampler};
+pub use sampler::Plan;
 pub use schedule::{Schedule, Step, cumulative_alphas};
 pub use settings::{DiffusionSettings, INDOOR_PROMPT, NEGATIVE_PROMPT, Preset, STREET_PROMPT};
 pub use text_encoder::TextEncoder;

@@ -145,7 +145,7 @@ impl Tile<'_> {
             for row in 0..ROWS {
                 for group in 0..GROUPS {
                     // SAFETY: the caller vouches for the rows of `c`.
-                    sums[row][group] = simd.load(unsafe { place(c, row * self.c_stride, group) });
+                    sums[row][group] = simd.load(unsafe { read(c, row * self.c_stride, group) });
                 }
             }
         }
@@ -163,7 +163,7 @@ impl Tile<'_> {
                 let mut columns = [simd.splat(0.0); GROUPS];
                 for group in 0..GROUPS {
                     // SAFETY: the caller vouches for the columns of this step.
-                    columns[group] = simd.load(unsafe { place(b.cast_mut(), 0, group) });
+                    columns[group] = simd.load(unsafe { read(b, 0, group) });
                 }
                 for row in 0..ROWS {
                     // SAFETY: `step` is within the segment.
@@ -184,18 +184,156 @@ impl Tile<'_> {
         for row in 0..ROWS {
             for group in 0..GROUPS {
                 // SAFETY: the caller vouches for the rows of `c`.
-                simd.store(sums[row][group], unsafe { place(c, row * self.c_stride, group) });
+                simd.store(sums[row][group], unsafe { write(c, row * self.c_stride, group) });
             }
         }
     }
 }
 
-/// A group of columns of a row.
+/// A group of columns of a row, to be read: other threads may read it too.
+///
+/// # Safety
+/// The group exists and nobody writes it.
+#[inline(always)]
+unsafe fn read<'a>(start: *const f32, row: usize, group: usize) -> &'a [f32; LANES] {
+    // SAFETY: what the caller vouches for.
+    unsafe { &*start.add(row + group * LANES).cast() }
+}
+
+/// A group of columns of a row, to be written.
 ///
 /// # Safety
 /// The group exists and nothing else refers to it.
 #[inline(always)]
-unsafe fn place<'a>(start: *mut f32, row: usize, group: usize) -> &'a mut [f32; LANES] {
+unsafe fn write<'a>(start: *mut f32, row: usize, group: usize) -> &'a mut [f32; LANES] {
     // SAFETY: what the caller vouches for.
     unsafe { &mut *start.add(row + group * LANES).cast() }
+}
+
+#[cfg(test)]
+mod tests {
+    //! Whole numbers, so that every order of the sums gives the same, in operands of exactly the size that is needed, so
+    //! that a memory checker sees what is read or written beyond. Small enough for Miri.
+    use half::bf16;
+
+    use super::*;
+
+    /// Rows begin where they like, and share what they read.
+    const STARTS: [u32; 15] = [4, 0, 9, 2, 7, 1, 8, 3, 0, 6, 5, 9, 1, 2, 10];
+    const SEGMENTS: [Segment; 3] = [
+        Segment { offset: 3, steps: 2 },
+        Segment { offset: 0, steps: 0 },
+        Segment { offset: 1, steps: 5 },
+    ];
+    const STEPS: usize = 7;
+    /// Beyond the columns, in `b` and `c`.
+    const GAP: usize = 3;
+    const UNTOUCHED: f32 = 0.5;
+
+    /// Both sides of a product, and what it is written over.
+    struct Operands {
+        a: Vec<f32>,
+        b: Vec<f32>,
+        c: Vec<f32>,
+        rows: usize,
+        groups: usize,
+    }
+
+    fn number(index: usize) -> f32 {
+        (index * 7 % 11) as f32 - 5.0
+    }
+
+    /// What stands at this place of an operand: a number, or a pair of bf16.
+    fn unit(precision: Precision, index: usize) -> f32 {
+        let half = |index| u32::from(bf16::from_f32(number(index)).to_bits());
+        match precision {
+            Precision::F32 => number(index),
+            Precision::Bf16 => f32::from_bits(half(index) | half(index + 1) << 16),
+        }
+    }
+
+    /// The product of two units.
+    fn product(precision: Precision, a: usize, b: usize) -> f32 {
+        match precision {
+            Precision::F32 => number(a) * number(b),
+            Precision::Bf16 => number(a) * number(b) + number(a + 1) * number(b + 1),
+        }
+    }
+
+    impl Operands {
+        fn new(precision: Precision, rows: usize, groups: usize) -> Operands {
+            let width = groups * LANES;
+            let reach = STARTS[..rows].iter().max().map_or(0, |&start| start as usize) + 6;
+            let units = |count: usize| (0..count).map(|index| unit(precision, index)).collect();
+            Operands {
+                a: units(reach),
+                b: units((STEPS - 1) * (width + GAP) + width),
+                c: vec![UNTOUCHED; (rows - 1) * (width + GAP) + width],
+                rows,
+                groups,
+            }
+        }
+
+        fn tile(&self, accumulate: bool) -> Tile<'_> {
+            let stride = self.groups * LANES + GAP;
+            Tile {
+                a: &self.a,
+                rows: &STARTS[..self.rows],
+                segments: &SEGMENTS,
+                b: &self.b,
+                b_stride: stride,
+                c_stride: stride,
+                groups: self.groups,
+                accumulate,
+            }
+        }
+
+        /// What a number of `c` must be, after being stored once and added to once.
+        fn expected(&self, precision: Precision, at: usize) -> f32 {
+            let stride = self.groups * LANES + GAP;
+            let (row, column) = (at / stride, at % stride);
+            if column >= self.groups * LANES {
+                return UNTOUCHED;
+            }
+            let units = SEGMENTS.iter().flat_map(|s| s.offset..s.offset + s.steps);
+            let units = units.map(|offset| (STARTS[row] + offset) as usize).enumerate();
+            2.0 * units.map(|(step, a)| product(precision, a, step * stride + column)).sum::<f32>()
+        }
+    }
+
+    fn sizes() -> impl Iterator<Item = (usize, usize)> {
+        let (rows, groups) = if cfg!(miri) { (3, 2) } else { (STARTS.len(), 5) };
+        (1..=rows).flat_map(move |rows| (1..=groups).map(move |groups| (rows, groups)))
+    }
+
+    #[test]
+    fn every_tile_of_every_processor_is_the_product_and_stays_within_its_operands() {
+        for processor in Processor::available() {
+            for precision in [Precision::F32, Precision::Bf16] {
+                for (rows, groups) in sizes() {
+                    let operands = Operands::new(precision, rows, groups);
+                    let mut c = operands.c.clone();
+                    operands.tile(false).multiply(processor, precision, &mut c);
+                    operands.tile(true).multiply(processor, precision, &mut c);
+                    let expected = (0..c.len()).map(|at| operands.expected(precision, at));
+                    let name = processor.name();
+                    assert!(c.iter().copied().eq(expected), "{name} {precision:?} {rows} {groups}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn operands_fit_with_nothing_to_spare() {
+        for (rows, groups) in sizes() {
+            let operands = Operands::new(Precision::F32, rows, groups);
+            let Operands { a, b, c, .. } = &operands;
+            let fits =
+                |a: &[f32], b: &[f32], c: &[f32]| Tile { a, b, ..operands.tile(true) }.fits(c);
+            assert!(fits(a, b, c));
+            assert!(!fits(&a[1..], b, c));
+            assert!(!fits(a, &b[1..], c));
+            assert!(!fits(a, b, &c[1..]));
+        }
+    }
 }

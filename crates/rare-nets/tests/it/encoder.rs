@@ -64,6 +64,18 @@ fn maps_of_mixed_sizes_come_back_in_their_order() {
     assert!(load(&pipeline, &settings).unwrap().encode(&[]).unwrap().is_empty());
 }
 
+/// What a cache does not know is encoded by itself, with the noise of its place, and in the order that is asked for.
+#[test]
+fn some_maps_are_encoded_as_among_all() {
+    let Some(pipeline) = pipeline() else { return };
+    let settings = DiffusionSettings { layers: vec![3], ..DiffusionSettings::default() };
+    let maps = [map(64, 64, 0), map(64, 64, 1), map(64, 64, 2), map(64, 64, 3)];
+    let all = encode(&pipeline, &settings, &maps);
+    let encoder = load(&pipeline, &settings).unwrap();
+    let some = encoder.encode_at(&[(3, &maps[3]), (1, &maps[1])]).unwrap();
+    assert!(some == [all[3].clone(), all[1].clone()]);
+}
+
 #[test]
 fn noise_depends_on_seed_view_and_cloud() {
     let Some(pipeline) = pipeline() else { return };

@@ -19,3 +19,8 @@ mod schedule;
 mod shared;
 mod text_encoder;
 mod tokenizer;
+#[cfg(feature = "fetch")]
+mod weights;
+#[cfg(feature = "fetch")]
+#[expect(dead_code, reason = "shared with the tests of the program, which make other mistakes")]
+mod weights_server;

@@ -2,7 +2,7 @@
 
 use rare_nets::checkpoint::Parameters;
 use rare_nets::diffusion::{TextConfig, TextEncoder};
-use rare_nets::engine::Backend;
+use rare_nets::engine::{Backend, CpuBackend, Precision, Processor};
 
 use crate::reference_backend::ReferenceBackend;
 use crate::shared::{self, Array, Golden};
@@ -57,8 +57,15 @@ fn follows_the_recording<B: Backend>(backend: &B) {
 }
 
 #[test]
-fn the_reference_backend_follows_the_recording() {
+fn the_reference_backend_follows_the_recorded_text() {
     follows_the_recording(&ReferenceBackend::default());
+}
+
+#[test]
+fn every_processor_follows_the_recorded_text() {
+    for processor in Processor::available() {
+        follows_the_recording(&CpuBackend::on(processor, Precision::F32));
+    }
 }
 
 #[test]

@@ -9,7 +9,7 @@ use super::npy::Array;
 use super::npz::{self, Entry, NpzFile};
 use super::whole_file::write_whole;
 use crate::data::{Correspondence, PointFeatures};
-use crate::encode::Recorded;
+use crate::encode::{MapSummary, Recorded, Recording, map_names};
 use crate::error::{Error, Result};
 
 /// Reads points with a feature vector each: an NPZ archive of `points` (`N x 3`, metres, in the cloud's frame) and
@@ -41,18 +41,8 @@ pub fn read_point_features(path: impl AsRef<Path>) -> Result<PointFeatures> {
 pub fn write_point_features(path: impl AsRef<Path>, features: &PointFeatures) -> Result<()> {
     let coordinates = features.points().iter().flat_map(|point| point.coords.as_slice());
     let entries = [
-        Entry {
-            name: "points",
-            kind: "f8",
-            shape: &[features.len(), 3],
-            data: coordinates.flat_map(|value| value.to_le_bytes()).collect(),
-        },
-        Entry {
-            name: "features",
-            kind: "f4",
-            shape: &[features.len(), features.dimension()],
-            data: features.values().iter().flat_map(|value| value.to_le_bytes()).collect(),
-        },
+        Entry::f64("points", &[features.len(), 3], coordinates),
+        Entry::f32("features", &[features.len(), features.dimension()], features.values()),
     ];
     write_whole(path, |writer| npz::write(writer, &entries))
 }
@@ -76,6 +66,39 @@ pub fn read_depth_features(path: impl AsRef<Path>) -> Result<Recorded> {
     }
     Recorded::from_arrays(&Matrix4::from_row_slice(&initial.values), arrays)
         .map_err(|error| super::name_file(path, error))
+}
+
+/// Writes what [`read_depth_features`] reads, exactly: the layers as 32-bit floats, the transform as 64-bit floats.
+///
+/// # Errors
+/// `Io` if there are 4 GiB or more, otherwise those of [`write_whole`].
+pub fn write_depth_features(path: impl AsRef<Path>, recorded: &Recorded) -> Result<()> {
+    let initial = recorded.initial().to_matrix().transpose();
+    let mut entries = vec![Entry::f64("initial", &[4, 4], initial.as_slice())];
+    entries.extend(recorded.recording().into_iter().flat_map(recording_entries));
+    let names = map_names(recorded.features().len() / 2);
+    for (name, layers) in names.iter().zip(recorded.features()) {
+        for (number, layer) in layers.iter().enumerate() {
+            let shape = [layer.channels(), layer.height(), layer.width()];
+            entries.push(Entry::f32(format!("{name}_layer{number}"), &shape, layer.values()));
+        }
+    }
+    write_whole(path, |writer| npz::write(writer, &entries))
+}
+
+fn recording_entries(recording: &Recording) -> [Entry; 4] {
+    let row = |map: &MapSummary| {
+        [map.width as f64, map.height as f64, map.seen as f64, f64::from(map.mean_depth)]
+    };
+    let rows: Vec<f64> = recording.maps.iter().flat_map(row).collect();
+    let components = recording.components.unwrap_or(0) as f64;
+    let aligned_corners = f64::from(u8::from(recording.aligned_corners));
+    [
+        Entry::f64("depth_maps", &[recording.maps.len(), 4], &rows),
+        Entry::f64("components", &[1], &[components]),
+        Entry::f64("aligned_corners", &[1], &[aligned_corners]),
+        Entry::bytes("settings", recording.settings.as_bytes()),
+    ]
 }
 
 /// Reads correspondences: an NPZ archive of `source` and `reference` (`N x 3`, metres, each in its cloud's frame) and,

@@ -231,21 +231,44 @@ fn check_directory(bytes: &[u8]) -> Result<()> {
 }
 
 /// One array to be written: its name, `NumPy`'s type string without the byte order, its shape and its bytes.
-pub(super) struct Entry<'a> {
-    pub(super) name: &'a str,
-    pub(super) kind: &'a str,
-    pub(super) shape: &'a [usize],
-    pub(super) data: Vec<u8>,
+pub(super) struct Entry {
+    name: String,
+    kind: &'static str,
+    shape: Vec<usize>,
+    data: Vec<u8>,
+}
+
+impl Entry {
+    /// An array of 64-bit floats in C order.
+    pub(super) fn f64<'a>(
+        name: impl Into<String>,
+        shape: &[usize],
+        values: impl IntoIterator<Item = &'a f64>,
+    ) -> Entry {
+        let data = values.into_iter().flat_map(|value| value.to_le_bytes()).collect();
+        Entry { name: name.into(), kind: "f8", shape: shape.to_vec(), data }
+    }
+
+    /// An array of 32-bit floats in C order.
+    pub(super) fn f32(name: impl Into<String>, shape: &[usize], values: &[f32]) -> Entry {
+        let data = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        Entry { name: name.into(), kind: "f4", shape: shape.to_vec(), data }
+    }
+
+    /// Bytes one after the other.
+    pub(super) fn bytes(name: &str, bytes: &[u8]) -> Entry {
+        Entry { name: name.to_owned(), kind: "u1", shape: vec![bytes.len()], data: bytes.to_vec() }
+    }
 }
 
 /// Writes an archive of stored arrays. The same arrays give the same bytes: no time of writing is in them, and floats
 /// hardly compress.
-pub(super) fn write(writer: &mut dyn Write, entries: &[Entry<'_>]) -> io::Result<()> {
+pub(super) fn write(writer: &mut dyn Write, entries: &[Entry]) -> io::Result<()> {
     let mut directory = Vec::new();
     let mut at = 0;
     for entry in entries {
         let mut content = Vec::with_capacity(entry.data.len() + 128);
-        super::npy::write_header(&mut content, entry.kind, entry.shape)?;
+        super::npy::write_header(&mut content, entry.kind, &entry.shape)?;
         content.extend_from_slice(&entry.data);
         let name = format!("{}.npy", entry.name);
         let described = describe(&name, &content)?;

@@ -50,6 +50,23 @@ pub fn reduce(
     Ok((concatenate(&merged_a, height, width)?, concatenate(&merged_b, height, width)?))
 }
 
+/// Merges the layers of one map alone, without analysis: a single layer as it is, several normalised, enlarged to the
+/// largest and joined.
+///
+/// # Errors
+/// `InvalidInput` if there is no layer, or features are not finite.
+pub fn merge(layers: &LayeredFeatures) -> Result<FeatureMap> {
+    if let [only] = layers.as_slice() {
+        return Ok(only.clone());
+    }
+    let (height, width) = largest(layers.iter());
+    let enlarged = |layer: &FeatureMap| {
+        let layer = Columns::normalised(layer)?.to_map()?;
+        resize_bilinear(&layer, height, width, Corners::HalfPixel)
+    };
+    concatenate(&layers.iter().map(enlarged).collect::<Result<Vec<_>>>()?, height, width)
+}
+
 /// Reduces one layer of the two maps of a view.
 fn reduce_layer(
     a: &FeatureMap,

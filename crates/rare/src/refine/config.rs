@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::encode::Recorded;
+use crate::reduce::DEFAULT_COMPONENTS;
 use crate::scale::Profile;
 use crate::viewpoints::CameraChoice;
 
@@ -92,6 +94,28 @@ impl Recipe {
             reweighting_rounds: 5,
             top: 250,
             keypoints: None,
+        }
+    }
+
+    /// The same recipe for features of a network with several layers, as FreeReg treats them: principal components of
+    /// each layer, interpolation with aligned corners.
+    #[must_use]
+    pub fn for_network(self) -> Recipe {
+        Recipe { components: Some(DEFAULT_COMPONENTS), aligned_corners: true, ..self }
+    }
+
+    /// The same recipe for recorded features: one round, because under another pose the views show other things, and
+    /// the reduction and interpolation that were recorded with them.
+    #[must_use]
+    pub fn for_recorded(self, recorded: &Recorded) -> Recipe {
+        let recipe = Recipe { rounds: 1, ..self };
+        match recorded.recording() {
+            Some(recording) => Recipe {
+                components: recording.components,
+                aligned_corners: recording.aligned_corners,
+                ..recipe
+            },
+            None => recipe,
         }
     }
 }

@@ -100,6 +100,25 @@ pub(super) fn transfer_all(
     views.into_par_iter().map(|((view, maps), features)| lift_view(view, maps, features)).collect()
 }
 
+/// Step 5 of the reference alone, which has a map in every view: what all views show, one after the other.
+pub(super) fn lift_own(
+    pair: &WorkingPair<'_>,
+    viewpoints: &[Viewpoint],
+    maps: &[DepthMap],
+    features: &[FeatureMap],
+    sampling: Sampling,
+) -> Result<PointFeatures> {
+    let dimension = features.first().map_or(0, FeatureMap::channels);
+    let (mut points, mut values) = (Vec::new(), Vec::new());
+    for ((view, map), features) in viewpoints.iter().zip(maps).zip(features) {
+        let cloud_from_camera = view.camera.camera_from_world.inverse();
+        let lifted = lift(features, map, pair.scale.depth_range, sampling).keypoints;
+        points.extend(lifted.points().iter().map(|point| cloud_from_camera.apply(point)));
+        values.extend_from_slice(lifted.values());
+    }
+    PointFeatures::new(points, dimension, values)
+}
+
 /// Step 6: the common points of every view with fused features.
 pub(super) fn fuse_all(
     pair: &WorkingPair<'_>,

@@ -10,6 +10,7 @@
 mod aggregate;
 mod clouds;
 mod densify;
+mod encoded_views;
 mod fpfh;
 mod hint;
 mod hostile_files;

@@ -283,22 +283,25 @@ struct Positions {
 }
 
 impl DepthEncoder for Positions {
-    fn encode(&self, maps: &[DepthMap]) -> rare::Result<Vec<LayeredFeatures>> {
-        assert_eq!(maps.len(), 4);
-        let encode = |(map, common_from_camera): (&DepthMap, &RigidTransform)| {
-            let (columns, rows) = (map.width() / 10, map.height() / 10);
-            let feature = |cell: usize| -> Vec<f32> {
-                let (u, v) = (cell % columns * 10 + 5, cell / columns * 10 + 5);
-                let camera = map.intrinsics();
-                let seen = camera.back_project(u as f64, v as f64, f64::from(map.at(u, v)));
-                let place = common_from_camera.apply(&seen);
-                place.iter().flat_map(|x| [x.sin() as f32, x.cos() as f32]).collect()
-            };
-            let features: Vec<Vec<f32>> = (0..columns * rows).map(feature).collect();
-            let values = (0..6).flat_map(|c| features.iter().map(move |f| f[c])).collect();
-            Ok(vec![FeatureMap::new(6, rows, columns, values)?])
+    fn encode_at(&self, maps: &[(usize, &DepthMap)]) -> rare::Result<Vec<LayeredFeatures>> {
+        maps.iter().map(|&(index, map)| self.encode_map(index, map)).collect()
+    }
+}
+
+impl Positions {
+    fn encode_map(&self, index: usize, map: &DepthMap) -> rare::Result<LayeredFeatures> {
+        let common_from_camera = &self.common_from_camera[index];
+        let (columns, rows) = (map.width() / 10, map.height() / 10);
+        let feature = |cell: usize| -> Vec<f32> {
+            let (u, v) = (cell % columns * 10 + 5, cell / columns * 10 + 5);
+            let camera = map.intrinsics();
+            let seen = camera.back_project(u as f64, v as f64, f64::from(map.at(u, v)));
+            let place = common_from_camera.apply(&seen);
+            place.iter().flat_map(|x| [x.sin() as f32, x.cos() as f32]).collect()
         };
-        maps.iter().zip(&self.common_from_camera).map(encode).collect()
+        let features: Vec<Vec<f32>> = (0..columns * rows).map(feature).collect();
+        let values = (0..6).flat_map(|c| features.iter().map(move |f| f[c])).collect();
+        Ok(vec![FeatureMap::new(6, rows, columns, values)?])
     }
 }
 

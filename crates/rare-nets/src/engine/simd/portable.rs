@@ -1,7 +1,10 @@
-//! Plain Rust, for processors without anything better and as the reference of the others.
+//! What every processor of an architecture has (SSE2, plain Rust), for those without anything better and as the
+//! reference of the others.
 #![allow(unsafe_code)]
 
+use bytemuck::cast;
 use half::{bf16, f16};
+use wide::{f32x4, u32x4};
 
 use super::super::tile::{Tile, choose_tile};
 use super::{LANES, Simd};
@@ -10,28 +13,37 @@ use super::{LANES, Simd};
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Portable;
 
-type Floats = [f32; LANES];
+type Floats = [f32x4; 4];
 
-/// Lane by lane.
+/// 1.5 * 2^23: the last bit of it is worth 1.
+const SHIFT: f32 = 12_582_912.0;
+
+/// Register by register.
 #[inline(always)]
-fn each(operation: impl Fn(usize) -> f32) -> Floats {
-    let mut result = [0.0; LANES];
-    for (lane, value) in result.iter_mut().enumerate() {
-        *value = operation(lane);
-    }
-    result
+fn each(operation: impl Fn(usize) -> f32x4) -> Floats {
+    [operation(0), operation(1), operation(2), operation(3)]
 }
 
-/// The upper and the lower bf16 of 32 bits.
+/// The bits of 16-bit elements in the lower halves of 32 bits, register by register.
 #[inline(always)]
-fn pair(bits: f32) -> (f32, f32) {
-    let bits = bits.to_bits();
-    (f32::from_bits(bits & 0xffff_0000), f32::from_bits(bits << 16))
+fn wider(bits: impl Fn(usize) -> u16) -> [u32x4; 4] {
+    let four = |first: usize| {
+        u32x4::new([first, first + 1, first + 2, first + 3].map(|lane| u32::from(bits(lane))))
+    };
+    [four(0), four(4), four(8), four(12)]
+}
+
+/// The numbers whose bits are the upper halves of every 32 bits, and those whose bits are the lower halves.
+#[inline(always)]
+fn pairs(bits: f32x4) -> (f32x4, f32x4) {
+    let bits: u32x4 = cast(bits);
+    (cast(bits & u32x4::splat(0xffff_0000)), cast(bits << 16))
 }
 
 /// Halves onto each other, until one lane is left.
 #[inline(always)]
-fn fold(mut lanes: Floats, operation: impl Fn(f32, f32) -> f32) -> f32 {
+fn fold(floats: Floats, operation: impl Fn(f32, f32) -> f32) -> f32 {
+    let mut lanes: [f32; LANES] = cast(floats.map(f32x4::to_array));
     for half in [8, 4, 2, 1] {
         for lane in 0..half {
             lanes[lane] = operation(lanes[lane], lanes[lane + half]);
@@ -63,102 +75,106 @@ impl Simd for Portable {
 
     #[inline(always)]
     fn splat(self, value: f32) -> Floats {
-        [value; LANES]
+        [f32x4::splat(value); 4]
     }
 
     #[inline(always)]
     fn load(self, values: &[f32; LANES]) -> Floats {
-        *values
+        let quarters = values.as_chunks::<4>().0;
+        each(|quarter| f32x4::new(quarters[quarter]))
     }
 
     #[inline(always)]
     fn store(self, floats: Floats, values: &mut [f32; LANES]) {
-        *values = floats;
+        for (quarter, values) in floats.into_iter().zip(values.as_chunks_mut::<4>().0) {
+            *values = quarter.to_array();
+        }
     }
 
     #[inline(always)]
     fn load_f16(self, values: &[f16; LANES]) -> Floats {
+        let bits = wider(|lane| values[lane].to_bits());
         // Sign aside, the bits of a half are those of a single whose exponent is 112 too small.
-        let rebias = f32::from_bits((127 + 112) << 23);
-        each(|lane| {
-            let bits = u32::from(values[lane].to_bits());
-            let magnitude = f32::from_bits((bits & 0x7fff) << 13) * rebias;
-            f32::from_bits(magnitude.to_bits() | (bits & 0x8000) << 16)
+        let rebias = f32x4::splat(f32::from_bits((127 + 112) << 23));
+        each(|quarter| {
+            let magnitude: f32x4 = cast((bits[quarter] & u32x4::splat(0x7fff)) << 13);
+            let sign = (bits[quarter] & u32x4::splat(0x8000)) << 16;
+            cast(cast::<f32x4, u32x4>(magnitude * rebias) | sign)
         })
     }
 
     #[inline(always)]
     fn load_bf16(self, values: &[bf16; LANES]) -> Floats {
-        each(|lane| f32::from_bits(u32::from(values[lane].to_bits()) << 16))
+        let bits = wider(|lane| values[lane].to_bits());
+        each(|quarter| cast(bits[quarter] << 16))
     }
 
     #[inline(always)]
     fn store_bf16(self, floats: Floats, values: &mut [bf16; LANES]) {
-        for (value, float) in values.iter_mut().zip(floats) {
-            let bits = float.to_bits();
-            let to_even = 0x7fff + ((bits >> 16) & 1);
-            *value = bf16::from_bits((bits.wrapping_add(to_even) >> 16) as u16);
+        for (quarter, values) in floats.into_iter().zip(values.as_chunks_mut::<4>().0) {
+            let bits: u32x4 = cast(quarter);
+            let to_even = ((bits >> 16) & u32x4::splat(1)) + u32x4::splat(0x7fff);
+            let rounded: u32x4 = (bits + to_even) >> 16;
+            *values = rounded.to_array().map(|bits| bf16::from_bits(bits as u16));
         }
     }
 
     #[inline(always)]
     fn add(self, a: Floats, b: Floats) -> Floats {
-        each(|lane| a[lane] + b[lane])
+        each(|quarter| a[quarter] + b[quarter])
     }
 
     #[inline(always)]
     fn sub(self, a: Floats, b: Floats) -> Floats {
-        each(|lane| a[lane] - b[lane])
+        each(|quarter| a[quarter] - b[quarter])
     }
 
     #[inline(always)]
     fn mul(self, a: Floats, b: Floats) -> Floats {
-        each(|lane| a[lane] * b[lane])
+        each(|quarter| a[quarter] * b[quarter])
     }
 
     #[inline(always)]
     fn div(self, a: Floats, b: Floats) -> Floats {
-        each(|lane| a[lane] / b[lane])
+        each(|quarter| a[quarter] / b[quarter])
     }
 
     #[inline(always)]
     fn max(self, a: Floats, b: Floats) -> Floats {
-        each(|lane| if a[lane] > b[lane] { a[lane] } else { b[lane] })
+        each(|quarter| a[quarter].fast_max(b[quarter]))
     }
 
     #[inline(always)]
     fn min(self, a: Floats, b: Floats) -> Floats {
-        each(|lane| if a[lane] < b[lane] { a[lane] } else { b[lane] })
+        each(|quarter| a[quarter].fast_min(b[quarter]))
     }
 
     #[inline(always)]
     fn mul_add(self, a: Floats, b: Floats, c: Floats) -> Floats {
         // Without an instruction for it, rounding once would be a function call.
-        each(|lane| a[lane] * b[lane] + c[lane])
+        each(|quarter| a[quarter] * b[quarter] + c[quarter])
     }
 
     #[inline(always)]
     fn dot_pairs(self, a: Floats, b: Floats, sum: Floats) -> Floats {
-        each(|lane| {
-            let ((a_high, a_low), (b_high, b_low)) = (pair(a[lane]), pair(b[lane]));
-            sum[lane] + a_low * b_low + a_high * b_high
+        each(|quarter| {
+            let ((a_high, a_low), (b_high, b_low)) = (pairs(a[quarter]), pairs(b[quarter]));
+            sum[quarter] + a_low * b_low + a_high * b_high
         })
     }
 
     #[inline(always)]
     fn round(self, a: Floats) -> Floats {
-        // The last bit of 1.5 * 2^23 is worth 1: adding it rounds.
-        const SHIFT: f32 = 12_582_912.0;
-        each(|lane| (a[lane] + SHIFT) - SHIFT)
+        each(|quarter| (a[quarter] + f32x4::splat(SHIFT)) - f32x4::splat(SHIFT))
     }
 
     #[inline(always)]
     fn power_of_two(self, a: Floats) -> Floats {
-        // In the last bits of 1.5 * 2^23 + a stands a; shifted, it is the exponent.
-        const SHIFT: f32 = 12_582_912.0;
-        each(|lane| {
-            let bits = (a[lane] + SHIFT).to_bits().wrapping_sub(SHIFT.to_bits());
-            f32::from_bits(bits.wrapping_add(127) << 23)
+        // In the last bits of SHIFT + a stands a; with the bias added and shifted, it is the exponent.
+        let bias = u32x4::splat(127_u32.wrapping_sub(SHIFT.to_bits()));
+        each(|quarter| {
+            let bits: u32x4 = cast(a[quarter] + f32x4::splat(SHIFT));
+            cast((bits + bias) << 23)
         })
     }
 
