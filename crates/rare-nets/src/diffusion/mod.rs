@@ -32,7 +32,6 @@ pub use layout::{
 pub use noise::Noise;
 pub use pipeline::{Pipeline, TokenizerFiles};
 pub use sampler::{Hints, Networks, Plan, Prediction, Sampler};
-pub use sampler::Plan;
 pub use schedule::{Schedule, Step, cumulative_alphas};
 pub use settings::{DiffusionSettings, INDOOR_PROMPT, NEGATIVE_PROMPT, Preset, STREET_PROMPT};
 pub use text_encoder::TextEncoder;

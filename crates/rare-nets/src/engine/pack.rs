@@ -139,11 +139,9 @@ pub(super) fn pack(
     match storage {
         Storage::F32 => permute(&as_f32(parts), sizes, &order, 1, elements.slice_mut()),
         Storage::F16 => permute(&as_f16(parts), sizes, &order, 1, elements.slice_mut()),
-        Storage::Bf16 => {
-            permute(&as_bf16(processor, parts), sizes, &order, 1, elements.slice_mut());
-        }
-        Storage::Pairs => {
-            permute(&as_bf16(processor, parts), sizes, &order, 2, elements.slice_mut());
+        Storage::Bf16 | Storage::Pairs => {
+            let together = if storage == Storage::Pairs { 2 } else { 1 };
+            permute(&as_bf16(processor, parts), sizes, &order, together, elements.slice_mut());
         }
     }
     let bias_of = |row: &Option<usize>| kernel.bias.and_then(|bias| bias.get((*row)?));

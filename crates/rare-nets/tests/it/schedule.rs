@@ -32,7 +32,8 @@ fn constants_of_the_steps_are_golden() {
     let schedule = Schedule::new(&config(), 20).unwrap();
     let times: Vec<usize> = schedule.steps.iter().rev().map(|step| step.time).collect();
     assert_eq!(times, golden.array("timesteps_ascending").usize());
-    let fields: [(&str, fn(&Step) -> f64); 5] = [
+    type Field = (&'static str, fn(&Step) -> f64);
+    let fields: [Field; 5] = [
         ("alphas", |step| step.alpha),
         ("alphas_prev", |step| step.next_alpha),
         ("sigmas", |step| step.sigma),
