@@ -93,7 +93,7 @@ impl OpenPipeline {
             None => Choice::default().default_folder(|name| env::var_os(name))?,
         };
         let pipeline = Pipeline::open(&weights)
-            .context("--encoder diffusion needs weights: name their folder with --weights")?;
+            .context("--encoder diffusion needs weights: name their folder with --weights, or get them with `rare weights fetch`")?;
         Plan::new(&diffusion.settings, &pipeline.scheduler)?;
         let identity = WeightsIdentity::of(&pipeline.files)?;
         if let Some(remark) = pipeline.remark.as_ref().filter(|_| !settings.quiet) {

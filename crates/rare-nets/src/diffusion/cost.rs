@@ -3,7 +3,6 @@
 mod operations;
 
 use std::collections::BTreeMap;
-use std::fs;
 
 use rare::data::Intrinsics;
 use rare::hint::{Percentiles, hint};
@@ -120,19 +119,6 @@ pub fn latent_size(intrinsics: &Intrinsics) -> Result<LatentSize> {
     Ok(LatentSize { height: image.height() / HINT_SCALE, width: image.width() / HINT_SCALE })
 }
 
-/// Memory that programs can still have, bytes; `None` where the system has no `/proc/meminfo`. Limits of a container are
-/// not seen.
-#[must_use]
-pub fn available_memory() -> Option<u64> {
-    available_in(&fs::read_to_string("/proc/meminfo").ok()?)
-}
-
-fn available_in(meminfo: &str) -> Option<u64> {
-    let line = meminfo.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
-    let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
-    kibibytes.checked_mul(1024)
-}
-
 /// The size whose maps together have the most pixels, and their number.
 fn largest_batch(maps: &[LatentSize]) -> Option<(LatentSize, usize)> {
     let mut counts: BTreeMap<LatentSize, usize> = BTreeMap::new();
@@ -149,17 +135,6 @@ fn gigabytes(bytes: u64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn memory_is_read_from_linux() {
-        let text = "MemTotal:  100 kB\nMemFree: 5 kB\nMemAvailable:      20 kB\nCached: 1 kB\n";
-        assert_eq!(available_in(text), Some(20 * 1024));
-        for text in
-            ["", "MemAvailable: kB", "MemAvailable: 18446744073709551615 kB", "MemAvailable: 5"]
-        {
-            assert_eq!(available_in(text), None, "{text}");
-        }
-    }
 
     #[test]
     fn a_lack_of_memory_is_refused() {

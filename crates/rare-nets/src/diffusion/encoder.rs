@@ -163,7 +163,11 @@ fn tokens(pipeline: &Pipeline, prompt: &str) -> Result<Tokens> {
     let tokens = match known_tokens(prompt) {
         Some(tokens) => tokens,
         None => {
-            let files = &pipeline.tokenizer;
+            let files = pipeline.tokenizer.as_ref().ok_or_else(|| {
+                Error::invalid(format!(
+                    "the prompt {prompt:?} needs the files vocab.json and merges.txt of CLIP's tokenizer beside the weights: put them there, or leave the prompts at their defaults"
+                ))
+            })?;
             Tokenizer::open(&files.vocabulary, &files.merges)?.encode(prompt)?.complete()?
         }
     };

@@ -20,8 +20,7 @@ pub use crate::engine::Precision;
 pub use config::{ControlNetConfig, SchedulerConfig, TextConfig, UnetConfig};
 pub use controlnet::{Control, ControlNet};
 pub use cost::{
-    Cost, LatentSize, available_memory, controlnet_operations, hint_operations, latent_size,
-    unet_operations,
+    Cost, LatentSize, controlnet_operations, hint_operations, latent_size, unet_operations,
 };
 pub use encoder::DiffusionEncoder;
 pub use layers::{Contexts, Timestep};

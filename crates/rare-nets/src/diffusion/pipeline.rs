@@ -43,8 +43,8 @@ pub struct Pipeline {
     pub text_config: TextConfig,
     /// The noise schedule.
     pub scheduler: SchedulerConfig,
-    /// What turns a prompt into tokens.
-    pub tokenizer: TokenizerFiles,
+    /// What turns a prompt into tokens, where the folder has it; the prompts of the presets do without.
+    pub tokenizer: Option<TokenizerFiles>,
     /// A sentence that says that these are not trained weights, where the folder or the sizes give it away.
     pub remark: Option<String>,
     /// All files that the pipeline is made of, sorted.
@@ -93,7 +93,9 @@ impl Pipeline {
         check_together(&unet, &controlnet, &text)?;
         let tokenizer = folder::tokenizer(&places)?;
         let remark = remark::remark(&places, &unet, &controlnet, &text);
-        let mut files = vec![tokenizer.vocabulary.clone(), tokenizer.merges.clone()];
+        let of_tokenizer =
+            |files: &TokenizerFiles| [files.vocabulary.clone(), files.merges.clone()];
+        let mut files: Vec<PathBuf> = tokenizer.iter().flat_map(of_tokenizer).collect();
         files.extend(scheduler.1);
         files.extend(unet.files());
         files.extend(controlnet.files());

@@ -154,6 +154,17 @@ fn prompts_that_are_too_long_are_refused() {
 }
 
 #[test]
+fn only_prompts_of_ones_own_need_a_tokenizer() {
+    let Some(mut pipeline) = pipeline() else { return };
+    pipeline.tokenizer = None;
+    assert!(load(&pipeline, &DiffusionSettings::default()).is_ok());
+    let settings =
+        DiffusionSettings { prompt: Some("a kitchen".to_owned()), ..DiffusionSettings::default() };
+    let message = load(&pipeline, &settings).map(drop).unwrap_err().to_string();
+    assert!(message.contains("a kitchen") && message.contains("vocab.json"), "{message}");
+}
+
+#[test]
 fn parts_of_other_models_are_refused() {
     let Some(mut pipeline) = pipeline() else { return };
     pipeline.text_config.vocabulary = 1000;

@@ -22,10 +22,11 @@ fn check(tiny: &Tiny, pipeline: &Pipeline) {
         words.contains("cannot be the trained weights") && words.contains("[16, 24, 40, 40]"),
         "{words}"
     );
-    assert!(pipeline.tokenizer.vocabulary.ends_with("vocab.json"));
-    assert!(pipeline.tokenizer.merges.ends_with("merges.txt"));
+    let tokenizer = pipeline.tokenizer.as_ref().unwrap();
+    assert!(tokenizer.vocabulary.ends_with("vocab.json"));
+    assert!(tokenizer.merges.ends_with("merges.txt"));
     assert!(pipeline.files.iter().all(|file| file.is_file()));
-    assert!(pipeline.files.contains(&pipeline.tokenizer.merges));
+    assert!(pipeline.files.contains(&tokenizer.merges));
 }
 
 fn check_part(expected: &Tensors, found: &Parameters) {
@@ -244,6 +245,16 @@ fn the_files_of_the_original_code_open() {
     // A tensor is named as in the file, too.
     let message = pipeline.unet.read("conv_in.weight", &[1]).unwrap_err().to_string();
     assert!(message.contains("model.diffusion_model.input_blocks.0.0.weight"), "{message}");
+}
+
+#[test]
+fn the_tokenizer_may_be_missing_but_not_halved() {
+    let Some(tiny) = Tiny::copied() else { return };
+    tiny.remove("tokenizer/merges.txt");
+    let message = Pipeline::open(tiny.path()).unwrap_err().to_string();
+    assert!(message.contains("merges.txt"), "{message}");
+    tiny.remove("tokenizer/vocab.json");
+    assert_eq!(open(tiny.path()).tokenizer, None);
 }
 
 #[test]

@@ -58,17 +58,16 @@ pub(super) fn scheduler(places: &Places) -> Result<(SchedulerConfig, Option<Path
     Ok((versions::scheduler(&json)?, Some(json.path)))
 }
 
-/// The files of the tokenizer, in their folder or beside everything else.
-pub(super) fn tokenizer(places: &Places) -> Result<TokenizerFiles> {
-    let file = |name: &str| {
-        places.file(&format!("tokenizer/{name}")).or_else(|| places.file(name)).ok_or_else(|| {
-            let looked_for = format!(
-                "tokenizer/{name} and {name}; a single weight file does not contain it: take it from the folder tokenizer of the repository of Stable Diffusion 1.5"
-            );
-            places.missing("tokenizer", &looked_for)
-        })
-    };
-    Ok(TokenizerFiles { vocabulary: file("vocab.json")?, merges: file("merges.txt")? })
+/// The files of the tokenizer, in their folder or beside everything else; none where neither is there, as with single
+/// weight files.
+pub(super) fn tokenizer(places: &Places) -> Result<Option<TokenizerFiles>> {
+    let file = |name: &str| places.file(&format!("tokenizer/{name}")).or_else(|| places.file(name));
+    match (file("vocab.json"), file("merges.txt")) {
+        (Some(vocabulary), Some(merges)) => Ok(Some(TokenizerFiles { vocabulary, merges })),
+        (None, None) => Ok(None),
+        (None, _) => Err(places.missing("tokenizer", "tokenizer/vocab.json and vocab.json")),
+        (_, None) => Err(places.missing("tokenizer", "tokenizer/merges.txt and merges.txt")),
+    }
 }
 
 /// One network of a folder.
