@@ -9,6 +9,7 @@
 
 mod checkpoint;
 mod encoder;
+mod engine;
 mod network_shapes;
 mod networks;
 mod pipeline;
