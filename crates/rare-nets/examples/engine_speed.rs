@@ -2,6 +2,7 @@
 //!
 //! Prints billions of operations per second of CPU time (Linux) over the best of some runs; `RARE_CPU` forces a set of
 //! instructions, `RAYON_NUM_THREADS` the number of threads.
+#![expect(clippy::print_stdout, reason = "the result")]
 
 use std::error::Error;
 use std::fs;

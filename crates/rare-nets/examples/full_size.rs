@@ -4,6 +4,7 @@
 //! `hint`; timestep 150) and what another implementation made of it (`layer_0`, `layer_3`, `layer_6`). Prints the
 //! relative difference of each layer (L2), then the time of loading and of runs to layer 6 with the same image MAPS
 //! times in a batch, wall and CPU (Linux).
+#![expect(clippy::print_stdout, reason = "the result")]
 
 use std::error::Error;
 use std::fs;

@@ -16,8 +16,8 @@ Examples:
   rare weights fetch weights --precision f32
   HF_TOKEN=... rare weights fetch
 
-The folder is printed. A download that broke off is continued; what is there already is not downloaded again, neither
-what other programs have put into the cache of the hub. Nothing is overwritten.
+The folder is printed. A download that broke off is continued. What is there already, or in the
+cache of the hub, is verified instead of downloaded again. Nothing is overwritten.
 
 Environment:
   HF_HOME, HF_HUB_CACHE  where the cache of the hub is [default: ~/.cache/huggingface]

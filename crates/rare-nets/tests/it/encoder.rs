@@ -5,13 +5,20 @@ use std::sync::{Arc, Mutex};
 use rare::data::{Intrinsics, LayeredFeatures};
 use rare::encode::DepthEncoder;
 use rare::{DepthMap, FeatureMap, Result};
-use rare_nets::diffusion::{DiffusionEncoder, DiffusionSettings, Pipeline, Preset};
+use rare_nets::diffusion::{
+    Cost, DiffusionEncoder, DiffusionSettings, Extent, Pipeline, Plan, Preset,
+    controlnet_operations, hint_operations, latent_size, unet_operations,
+};
 use rare_nets::engine::{CpuBackend, Precision};
 
 use crate::shared;
 
+/// The small networks with one head instead of eight, since attention takes nearly all of their time.
 fn pipeline() -> Option<Pipeline> {
-    Some(Pipeline::open(&shared::path("golden/rare/tiny-pipeline")?).unwrap())
+    let mut pipeline = Pipeline::open(&shared::path("golden/rare/tiny-pipeline")?).unwrap();
+    pipeline.unet_config.heads = 1;
+    pipeline.controlnet_config.unet.heads = 1;
+    Some(pipeline)
 }
 
 fn load(pipeline: &Pipeline, settings: &DiffusionSettings) -> Result<DiffusionEncoder<CpuBackend>> {
@@ -98,20 +105,20 @@ fn progress_is_told_until_all_passes_are_done() {
     let Some(pipeline) = pipeline() else { return };
     let told = Arc::new(Mutex::new(Vec::new()));
     let listener = Arc::clone(&told);
-    let settings = DiffusionSettings { steps: 4, ..Preset::Paper.settings() };
+    let settings = DiffusionSettings { steps: 2, layers: vec![0], ..Preset::Paper.settings() };
     let encoder = load(&pipeline, &settings)
         .unwrap()
         .with_progress(move |done, total| listener.lock().unwrap().push((done, total)));
-    // Three steps with two branches each, then the features.
-    assert_eq!(encoder.plan().passes(), 7);
+    // Two steps with two branches each, then the features.
+    assert_eq!(encoder.plan().passes(), 5);
     encoder.encode(&[map(64, 64, 0), map(64, 64, 1)]).unwrap();
-    assert_eq!(*told.lock().unwrap(), [(4, 14), (8, 14), (12, 14), (14, 14)]);
+    assert_eq!(*told.lock().unwrap(), [(4, 10), (8, 10), (10, 10)]);
 }
 
 #[test]
 fn settings_change_the_features() {
     let Some(pipeline) = pipeline() else { return };
-    let base = DiffusionSettings { steps: 4, layers: vec![0, 6], ..Preset::Paper.settings() };
+    let base = DiffusionSettings { steps: 1, layers: vec![0, 6], ..Preset::Paper.settings() };
     let maps = [map(64, 64, 0)];
     let encoded = |settings: &DiffusionSettings| encode(&pipeline, settings, &maps).remove(0);
     let features = encoded(&base);
@@ -158,4 +165,36 @@ fn parts_of_other_models_are_refused() {
     pipeline.text_config.vocabulary = 49408;
     pipeline.text_config.positions = 50;
     assert!(refused(&pipeline).contains("takes 50"), "{}", refused(&pipeline));
+}
+
+#[test]
+fn the_cost_counts_passes_maps_and_weights() {
+    let Some(pipeline) = pipeline() else { return };
+    let cost = |preset: Preset, precision, maps| {
+        let plan = Plan::new(&preset.settings(), &pipeline.scheduler).unwrap();
+        let size = latent_size(&Intrinsics::indoor()).unwrap();
+        Cost::estimate(&pipeline, &plan, precision, &vec![size; maps]).unwrap()
+    };
+    let single = cost(Preset::SingleStep, Precision::F32, 1);
+    let size = latent_size(&Intrinsics::indoor()).unwrap();
+    let pass = |extent| {
+        unet_operations(&pipeline.unet_config, size, extent)
+            + controlnet_operations(&pipeline.controlnet_config, size, extent)
+    };
+    let hint = hint_operations(&pipeline.controlnet_config, size);
+    assert_eq!(single.operations, hint + pass(Extent::UpToLayer(6)));
+    let paper = cost(Preset::Paper, Precision::F32, 1);
+    let expected = hint + 34.0 * pass(Extent::Whole) + pass(Extent::UpToLayer(6));
+    assert!((paper.operations / expected - 1.0).abs() < 1e-12);
+    // The whole networks: of the size of their files but for the headers.
+    let files = pipeline.unet.files().iter().chain(pipeline.controlnet.files());
+    let bytes: u64 = files.map(|file| std::fs::metadata(file).unwrap().len()).sum();
+    assert!((paper.weight_bytes as f64 / bytes as f64 - 1.0).abs() < 0.03);
+    assert!(single.weight_bytes < paper.weight_bytes);
+    let rough = cost(Preset::Paper, Precision::Bf16, 1);
+    assert_eq!(2 * rough.weight_bytes, paper.weight_bytes);
+    let four = cost(Preset::SingleStep, Precision::F32, 4);
+    assert_eq!(four.operations, 4.0 * single.operations);
+    assert!(four.other_bytes > single.other_bytes && paper.other_bytes > single.other_bytes);
+    assert_eq!(cost(Preset::Paper, Precision::F32, 0).operations, 0.0);
 }

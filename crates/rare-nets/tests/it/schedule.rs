@@ -4,6 +4,9 @@ use rare_nets::diffusion::{Schedule, SchedulerConfig, Step, cumulative_alphas};
 
 use crate::shared::{Golden, relative_difference};
 
+/// A constant of a step.
+type Field = fn(&Step) -> f64;
+
 fn config() -> SchedulerConfig {
     SchedulerConfig { beta_start: 0.00085, beta_end: 0.012, training_steps: 1000, offset: 1 }
 }
@@ -32,7 +35,7 @@ fn constants_of_the_steps_are_golden() {
     let schedule = Schedule::new(&config(), 20).unwrap();
     let times: Vec<usize> = schedule.steps.iter().rev().map(|step| step.time).collect();
     assert_eq!(times, golden.array("timesteps_ascending").usize());
-    let fields: [(&str, fn(&Step) -> f64); 5] = [
+    let fields: [(&str, Field); 5] = [
         ("alphas", |step| step.alpha),
         ("alphas_prev", |step| step.next_alpha),
         ("sigmas", |step| step.sigma),
