@@ -164,7 +164,7 @@ impl Operation for Given {
 }
 
 /// Random pixels, the first half of whose keys come again in the second half, in another block of keys. The largest
-/// score is 60: rounding one factor to bf16 moves it by 0.1, and so its exponential by a tenth.
+/// score is 60: rounding one factor to bf16 moves it by up to 0.1.
 fn large_scores(pixels: usize, head: usize) -> Given {
     let mut given = Given { head, values: numbers(7, pixels * 3 * head) };
     for key in 0..pixels / 2 {
