@@ -75,9 +75,28 @@ pub(super) trait Simd: Copy + Send + Sync {
     /// `2^a` for integers from -126 to 127.
     fn power_of_two(self, a: Self::Floats) -> Self::Floats;
     /// The sum of the lanes, always in the same order: halves onto each other.
-    fn sum(self, a: Self::Floats) -> f32;
+    #[inline(always)]
+    fn sum(self, a: Self::Floats) -> f32 {
+        fold(self, a, |a, b| a + b)
+    }
     /// The largest lane.
-    fn maximum(self, a: Self::Floats) -> f32;
+    #[inline(always)]
+    fn maximum(self, a: Self::Floats) -> f32 {
+        fold(self, a, f32::max)
+    }
+}
+
+/// Puts halves onto each other until one lane is left.
+#[inline(always)]
+fn fold<S: Simd>(simd: S, floats: S::Floats, operation: impl Fn(f32, f32) -> f32) -> f32 {
+    let mut lanes = [0.0; LANES];
+    simd.store(floats, &mut lanes);
+    for half in [8, 4, 2, 1] {
+        for lane in 0..half {
+            lanes[lane] = operation(lanes[lane], lanes[lane + half]);
+        }
+    }
+    lanes[0]
 }
 
 /// A piece of work that is compiled for every processor.

@@ -214,27 +214,4 @@ impl Simd for Avx2 {
             _mm256_castsi256_ps(_mm256_slli_epi32::<23>(exponent))
         })
     }
-
-    #[inline(always)]
-    fn sum(self, a: Floats) -> f32 {
-        fold(self, a, |a, b| a + b)
-    }
-
-    #[inline(always)]
-    fn maximum(self, a: Floats) -> f32 {
-        fold(self, a, f32::max)
-    }
-}
-
-/// Halves onto each other, until one lane is left.
-#[inline(always)]
-fn fold(simd: Avx2, floats: Floats, operation: impl Fn(f32, f32) -> f32) -> f32 {
-    let mut lanes = [0.0; LANES];
-    simd.store(floats, &mut lanes);
-    for half in [8, 4, 2, 1] {
-        for lane in 0..half {
-            lanes[lane] = operation(lanes[lane], lanes[lane + half]);
-        }
-    }
-    lanes[0]
 }

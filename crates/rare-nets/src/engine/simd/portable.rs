@@ -40,18 +40,6 @@ fn pairs(bits: f32x4) -> (f32x4, f32x4) {
     (cast(bits & u32x4::splat(0xffff_0000)), cast(bits << 16))
 }
 
-/// Halves onto each other, until one lane is left.
-#[inline(always)]
-fn fold(floats: Floats, operation: impl Fn(f32, f32) -> f32) -> f32 {
-    let mut lanes: [f32; LANES] = cast(floats.map(f32x4::to_array));
-    for half in [8, 4, 2, 1] {
-        for lane in 0..half {
-            lanes[lane] = operation(lanes[lane], lanes[lane + half]);
-        }
-    }
-    lanes[0]
-}
-
 impl Simd for Portable {
     type Floats = Floats;
 
@@ -176,15 +164,5 @@ impl Simd for Portable {
             let bits: u32x4 = cast(a[quarter] + f32x4::splat(SHIFT));
             cast((bits + bias) << 23)
         })
-    }
-
-    #[inline(always)]
-    fn sum(self, a: Floats) -> f32 {
-        fold(a, |a, b| a + b)
-    }
-
-    #[inline(always)]
-    fn maximum(self, a: Floats) -> f32 {
-        fold(a, f32::max)
     }
 }
