@@ -337,6 +337,10 @@ fn on_every_processor(test: impl Fn(CpuBackend)) {
 #[test]
 fn every_processor_follows_the_recording() {
     on_every_processor(|cpu| follows_the_recording(cpu, "16x24"));
+}
+
+#[test]
+fn the_best_processor_follows_the_large_recording() {
     follows_the_recording(CpuBackend::new(Precision::F32).unwrap(), "64x88");
 }
 
