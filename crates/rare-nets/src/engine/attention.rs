@@ -21,7 +21,7 @@ use packed_keys::PackedKeys;
 /// Queries of a block.
 const QUERIES: usize = 56;
 /// Keys of a block: scores of a block of queries fit the second-level cache beside keys and values.
-const KEYS: usize = 256;
+const KEYS: usize = 512;
 /// Keys of a panel: two groups.
 const PANEL: usize = 2 * LANES;
 /// The score of what must not be seen: its exponential is below 1e-37, and no arithmetic on it gives infinity.
