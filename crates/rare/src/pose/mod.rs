@@ -17,10 +17,23 @@ pub use icp_target::IcpTarget;
 pub use ransac::Ransac;
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
-pub use sc2_pcr::{Sc2Pcr, Sc2PcrMode, Sc2PcrSeeds};
+pub use sc2_pcr::{Sc2Pcr, Sc2PcrSeeds};
+
+use serde::{Deserialize, Serialize};
 
 use crate::data::{Correspondence, PointCloud, RigidTransform};
 use crate::error::Result;
+
+/// Whether the quirks of an estimator's released code are kept; the estimators list theirs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Mode {
+    /// As released: to repeat published numbers.
+    Faithful,
+    /// As one would want it.
+    #[default]
+    Fixed,
+}
 
 /// Estimates the rigid transform between two clouds from correspondences of which many may be wrong.
 pub trait PoseEstimator: Send + Sync {

@@ -3,7 +3,16 @@
 //! Two correspondences are compatible if they keep their distance; the number of correspondences compatible with both
 //! tells inliers from coincidences far better than compatibility alone. Reliable, well spread correspondences become
 //! seeds; around each one the most compatible others give a pose; the pose that most pairs agree with is polished.
-//! [`Sc2PcrMode`] lists where the released code differs from what one would want, and chooses.
+//!
+//! What [`Mode::Faithful`] keeps of the released code:
+//! * seeds are filled up to their exact number with correspondences that are no local maxima,
+//! * a longer set is cut to its first `max_points` in input order,
+//! * the polishing returns its last pose, even if an earlier one was better,
+//! * with fewer than `first_stage` correspondences, both stages keep 4.
+//!
+//! [`Mode::Fixed`]: local maxima alone are seeds, a longer set keeps its best-scored correspondences, the polishing
+//! returns its best pose, small sets use all they have. Not kept in either mode, below a millionth: weights are divided
+//! by their sum plus `1e-6`.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -13,24 +22,9 @@ use crate::error::{Error, Result};
 use crate::pose::consensus::{self, Difference, Hypothesis, Keep, Polish};
 use crate::pose::consistency::SoftMatrix;
 use crate::pose::spectral::leading_eigenvector;
-use crate::pose::{CompatibilityGraph, Consistency, PoseEstimate, PoseEstimator, fit_weighted};
-
-/// Whether the quirks of the released code are kept.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Sc2PcrMode {
-    /// As released:
-    /// * seeds are filled up to their exact number with correspondences that are no local maxima,
-    /// * a longer set is cut to its first `max_points` in input order,
-    /// * the polishing returns its last pose, even if an earlier one was better,
-    /// * with fewer than `first_stage` correspondences, both stages keep 4.
-    ///
-    /// Not kept in either mode, below a millionth: weights are divided by their sum plus `1e-6`.
-    Faithful,
-    /// Local maxima alone are seeds, a longer set keeps its best-scored correspondences, the polishing returns its
-    /// best pose, small sets use all they have.
-    Fixed,
-}
+use crate::pose::{
+    CompatibilityGraph, Consistency, Mode, PoseEstimate, PoseEstimator, fit_weighted,
+};
 
 /// The settings of SC2-PCR; lengths in metres.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -57,8 +51,8 @@ pub struct Sc2Pcr {
     pub polish_rounds: usize,
     /// Whether the scores of the correspondences weigh in confidences and fits; the paper ignores them.
     pub use_scores: bool,
-    /// Whether the quirks of the released code are kept.
-    pub mode: Sc2PcrMode,
+    /// Whether the quirks of the released code (above) are kept.
+    pub mode: Mode,
 }
 
 impl Sc2Pcr {
@@ -77,7 +71,7 @@ impl Sc2Pcr {
             polish_threshold: 0.10,
             polish_rounds: 20,
             use_scores: false,
-            mode: Sc2PcrMode::Fixed,
+            mode: Mode::Fixed,
         }
     }
 
@@ -191,8 +185,8 @@ impl Sc2Pcr {
             threshold: self.polish_threshold,
             rounds: self.polish_rounds,
             keep: match self.mode {
-                Sc2PcrMode::Faithful => Keep::Last,
-                Sc2PcrMode::Fixed => Keep::Best,
+                Mode::Faithful => Keep::Last,
+                Mode::Fixed => Keep::Best,
             },
         }
     }
@@ -263,7 +257,7 @@ impl<'a> Search<'a> {
         indices.sort_by(|&a, &b| key(b).total_cmp(&key(a)));
         let count = (self.settings.seed_ratio * self.pairs.len() as f64) as usize;
         indices.truncate(count.max(1));
-        if self.settings.mode == Sc2PcrMode::Fixed {
+        if self.settings.mode == Mode::Fixed {
             indices.retain(|&i| is_maximum[i]);
         }
         Sc2PcrSeeds { confidences, indices }
@@ -342,7 +336,7 @@ impl<'a> Search<'a> {
 
     fn stage_sizes(&self) -> (usize, usize) {
         let Sc2Pcr { first_stage, second_stage, mode, .. } = *self.settings;
-        if mode == Sc2PcrMode::Faithful && first_stage > self.pairs.len() {
+        if mode == Mode::Faithful && first_stage > self.pairs.len() {
             (4, 4)
         } else {
             (first_stage, second_stage)
@@ -364,7 +358,7 @@ fn most(mut numbered: Vec<(u32, usize)>, count: usize) -> impl Iterator<Item = u
 /// At most `max_points` of the pairs, with scores as they weigh.
 fn limited(pairs: &[Correspondence], settings: &Sc2Pcr) -> Vec<Correspondence> {
     let limit = settings.max_points;
-    if settings.mode == Sc2PcrMode::Faithful || pairs.len() <= limit {
+    if settings.mode == Mode::Faithful || pairs.len() <= limit {
         return consensus::weighed(&pairs[..limit.min(pairs.len())], settings.use_scores);
     }
     let mut order: Vec<usize> = (0..pairs.len()).collect();

@@ -1,7 +1,7 @@
 //! SC2-PCR against the released implementation, and on synthetic correspondences.
 
 use nalgebra::Vector3;
-use rare::pose::{Sc2Pcr, Sc2PcrMode};
+use rare::pose::{Mode, Sc2Pcr};
 use rare::{Correspondence, RigidTransform};
 
 use crate::shared::Golden;
@@ -25,7 +25,7 @@ fn confidences_seeds_and_pose_agree_with_the_released_code() {
     else {
         return;
     };
-    let settings = Sc2Pcr { mode: Sc2PcrMode::Faithful, ..Sc2Pcr::three_d_match() };
+    let settings = Sc2Pcr { mode: Mode::Faithful, ..Sc2Pcr::three_d_match() };
     let seeds = settings.seeds(&pairs).unwrap();
     let expected = golden.array("confidence").values;
     for (i, (ours, theirs)) in seeds.confidences.iter().zip(&expected).enumerate() {
@@ -58,7 +58,7 @@ fn confidences_seeds_and_pose_agree_with_the_released_code() {
 #[test]
 fn outliers_are_survived_in_both_modes() {
     for (count, share) in [(1000, 0.2), (1000, 0.1), (200, 0.2), (12, 0.7)] {
-        for mode in [Sc2PcrMode::Faithful, Sc2PcrMode::Fixed] {
+        for mode in [Mode::Faithful, Mode::Fixed] {
             let pairs = synthetic(count, share, &motion(), 3);
             let settings = Sc2Pcr { mode, ..Sc2Pcr::three_d_match() };
             let result = estimate(&settings, &pairs);
