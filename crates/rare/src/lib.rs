@@ -16,7 +16,7 @@
 //! | 9 | [`verify`] | is it believable |
 //! | all | [`refine`] | the order of the steps: [`Refiner`] |
 //!
-//! Around it: [`data`] (the nouns), [`pose`] (estimators), [`features`] (normals, histograms), [`io`] (files),
+//! Around it: [`data`] (the nouns), [`pose`] (estimators), [`eval`] (benchmarks), [`features`] (normals, histograms), [`io`] (files),
 //! [`synthetic`] (simulated scans), [`random`], [`error`].
 #![forbid(unsafe_code)]
 
@@ -26,6 +26,7 @@ pub mod densify;
 pub mod depth_features;
 pub mod encode;
 pub mod error;
+pub mod eval;
 pub mod features;
 pub mod fuse;
 pub mod hint;

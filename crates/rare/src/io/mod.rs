@@ -68,6 +68,15 @@ enum Format {
     E57,
 }
 
+/// The content of a text file.
+///
+/// # Errors
+/// `Io` if the file cannot be read, `InvalidInput` if it is empty or not UTF-8.
+pub(crate) fn read_text(path: &Path) -> Result<String> {
+    let bytes = whole_file::read_whole(path)?;
+    String::from_utf8(bytes).map_err(|_| Error::in_file(path, "this is not a text file"))
+}
+
 /// Reads a cloud, in the units and the frame of the file. Points that are not finite are dropped and counted.
 ///
 /// The content decides the format; the extension does only where the content has no mark of its own (text, KITTI).

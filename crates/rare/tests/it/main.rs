@@ -11,6 +11,7 @@ mod aggregate;
 mod clouds;
 mod densify;
 mod encoded_views;
+mod eval;
 mod fpfh;
 mod hint;
 mod hostile_files;
