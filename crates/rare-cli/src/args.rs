@@ -1,5 +1,6 @@
 //! What was typed.
 
+mod eval;
 mod weights;
 
 use std::path::PathBuf;
@@ -9,6 +10,9 @@ use clap_complete::Shell;
 use rare::InitialMethod;
 use serde::Serialize;
 
+pub(crate) use self::eval::{
+    DatasetKind, EvalArgs, Format, ProtocolChoice, ScoreArgs, ScoringArgs,
+};
 #[cfg(feature = "fetch")]
 pub(crate) use self::weights::FetchArgs;
 pub(crate) use self::weights::{CheckArgs, WeightsArgs, WeightsCommand};
@@ -79,6 +83,10 @@ pub(crate) enum Command {
     Demo(DemoArgs),
     /// Get and check the weights of the diffusion features
     Weights(WeightsArgs),
+    /// Compare methods on a benchmark; goes on where it was interrupted
+    Eval(EvalArgs),
+    /// Score results, or anybody's estimated transforms, by the protocols of the literature
+    Score(ScoreArgs),
     /// Print the completion script of a shell
     Completions(CompletionsArgs),
 }
@@ -158,12 +166,23 @@ pub(crate) struct FeaturesArgs {
 
 /// The command line. `features` has the options of the commands that register, but writes one file of its own.
 pub(crate) fn command() -> clap::Command {
-    Cli::command().mut_subcommand("features", |features| {
-        ["json", "save_aligned", "depth_features", "verbose"]
-            .into_iter()
-            .fold(features, |features, option| features.mut_arg(option, |arg| arg.hide(true)))
-            .mut_arg("output", |output| output.help("Write the features (NPZ)"))
-    })
+    Cli::command()
+        .mut_subcommand("features", |features| {
+            ["json", "save_aligned", "depth_features", "verbose"]
+                .into_iter()
+                .fold(features, |features, option| features.mut_arg(option, |arg| arg.hide(true)))
+                .mut_arg("output", |output| output.help("Write the features (NPZ)"))
+        })
+        .mut_subcommand("eval", |eval| {
+            ["json", "save_aligned", "depth_features", "verbose"]
+                .into_iter()
+                .fold(eval, |eval, option| eval.mut_arg(option, |arg| arg.hide(true)))
+                .mut_arg("output", |output| {
+                    output
+                        .value_name("DIR")
+                        .help("The folder of the results; made if it does not exist")
+                })
+        })
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]

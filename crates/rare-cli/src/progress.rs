@@ -128,3 +128,59 @@ impl Drop for Progress {
         self.spinner.finish_and_clear();
     }
 }
+
+/// Counts the pairs of an evaluation: a bar with rate and time left on a terminal, elsewhere a line now and then.
+pub(crate) struct Pairs {
+    bar: ProgressBar,
+    /// If lines are written: when counting began, when the last line was written, how many were done at first.
+    lines: Option<Mutex<(Instant, Instant, Option<u64>)>>,
+}
+
+impl Pairs {
+    /// Begins to count to `total`; shows nothing if `quiet`.
+    pub(crate) fn start(quiet: bool, total: usize) -> Pairs {
+        const BAR: &str = "{wide_bar} {pos} of {len} pairs, {per_sec}, {eta} left";
+        let terminal = io::stderr().is_terminal();
+        let bar = ProgressBar::new(total as u64);
+        bar.set_draw_target(if !quiet && terminal {
+            ProgressDrawTarget::stderr()
+        } else {
+            ProgressDrawTarget::hidden()
+        });
+        if let Ok(style) = ProgressStyle::with_template(BAR) {
+            bar.set_style(style);
+        }
+        let now = Instant::now();
+        Pairs { bar, lines: (!quiet && !terminal).then(|| Mutex::new((now, now, None))) }
+    }
+
+    /// So many are done, by whomever.
+    pub(crate) fn show(&self, done: usize) {
+        self.bar.set_position(done as u64);
+        if let Some(lines) = &self.lines {
+            lock(lines).2.get_or_insert(done as u64);
+        }
+    }
+
+    /// One more is done.
+    pub(crate) fn advance(&self) {
+        self.bar.inc(1);
+        let Some(lines) = &self.lines else { return };
+        let mut lines = lock(lines);
+        let (begun, last, first) = &mut *lines;
+        if last.elapsed() >= LINE {
+            *last = Instant::now();
+            let (done, total) = (self.bar.position(), self.bar.length().unwrap_or(0));
+            let own = done.saturating_sub(first.unwrap_or(0)).max(1);
+            let rate = begun.elapsed().as_secs_f64() / own as f64;
+            let left = duration_in_words(rate * total.saturating_sub(done) as f64);
+            summary::say(&format!("{done} of {total} pairs, {rate:.1} s each, {left} left"));
+        }
+    }
+}
+
+impl Drop for Pairs {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}

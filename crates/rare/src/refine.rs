@@ -176,6 +176,21 @@ impl Refiner {
         self.run(&pair, &initial, None, clock)
     }
 
+    /// The initial transform of [`Refiner::register`] alone.
+    ///
+    /// # Errors
+    /// As [`Refiner::register`].
+    pub fn estimate_initial(
+        &self,
+        source: &Scan,
+        target: &Scan,
+        method: InitialMethod,
+    ) -> Result<RigidTransform> {
+        let pair = WorkingPair::new(source, target, &self.config)?;
+        let verifier = self.verifier(&pair, &RigidTransform::identity());
+        Ok(pair.to_world(&initial::estimate(&pair, method, self.config.seed, &verifier)?))
+    }
+
     /// Rounds of the paper's method, each from the pose of the one before.
     fn run(
         &self,

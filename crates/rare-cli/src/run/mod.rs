@@ -3,10 +3,12 @@
 mod completions;
 mod convert;
 mod demo;
+mod eval;
 mod features;
 mod info;
 mod refine;
 mod register;
+mod score;
 mod weights;
 
 use std::io::{self, ErrorKind, Write};
@@ -33,6 +35,8 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
         Command::Convert(args) => convert::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Weights(args) => weights::run(args),
+        Command::Eval(args) => eval::run(args),
+        Command::Score(args) => score::run(&args),
         Command::Completions(args) => completions::run(&args),
     }
 }

@@ -1,0 +1,89 @@
+//! `rare eval`: methods on a benchmark, resumable at every pair.
+//!
+//! Pass 1 works on the pairs and writes what methods found into a folder of results; pass 2 scores the folder. Nothing
+//! that pass 2 prints depends on who found a result, when, or in which order.
+
+mod method;
+mod start;
+mod work;
+
+use anyhow::{Result, bail};
+use method::Method;
+use rare::eval::dataset::{self, Dataset};
+use rare::eval::results::{self, Benchmark, ResultsFolder};
+use serde_json::json;
+use start::Starts;
+
+use crate::args::{DatasetKind, EvalArgs, Format};
+use crate::options::Settings;
+use crate::{SUCCESS, run, summary};
+
+/// Everything that is to be done.
+struct Plan {
+    dataset: Dataset,
+    starts: Starts,
+    methods: Vec<Method>,
+    settings: Settings,
+    /// The pairs of this shard.
+    pairs: Vec<usize>,
+    jobs: usize,
+}
+
+pub(super) fn run(args: EvalArgs) -> Result<u8> {
+    let scoring = args.scoring.clone();
+    let is_shard = args.shard.is_some();
+    let plan = Plan::new(args)?;
+    let Some(folder) = plan.settings.output.clone() else {
+        bail!("the results need a folder: add --out DIR");
+    };
+    let results = ResultsFolder::begin(&folder, plan.benchmark()?)?;
+    work::finish(&plan, &results)?;
+    if is_shard {
+        summary::say("this shard is done: put all of them together with `rare score DIR...`");
+        return Ok(SUCCESS);
+    }
+    let methods = results::merge(&[results])?;
+    let comparisons = super::score::compare(&methods, plan.dataset.protocol, &scoring);
+    super::score::write_tables(&folder, &comparisons, &methods)?;
+    run::print(&super::score::in_format(&comparisons, Format::Text)?)?;
+    Ok(SUCCESS)
+}
+
+impl Plan {
+    fn new(args: EvalArgs) -> Result<Plan> {
+        let dataset = read_dataset(&args)?;
+        let settings = args.options.resolve()?;
+        let methods = Method::parse_all(&args.methods, &settings)?;
+        let starts = Starts::read(&args.init, &args.root, &dataset)?;
+        let (index, count) = args.shard.unwrap_or((0, 1));
+        let pairs = (0..dataset.pairs.len()).skip(index).step_by(count).collect();
+        Ok(Plan { dataset, starts, methods, settings, pairs, jobs: usize::from(args.jobs) })
+    }
+
+    /// What the results depend on.
+    fn benchmark(&self) -> Result<Benchmark> {
+        Ok(Benchmark {
+            name: self.dataset.name.clone(),
+            protocol: self.dataset.protocol,
+            settings: json!({
+                "start": self.starts.description(),
+                "refiner": serde_json::to_value(&self.settings.refiner)?,
+                "version": env!("CARGO_PKG_VERSION"),
+            }),
+            pairs: self.dataset.pairs.iter().map(|pair| (&pair.truth).into()).collect(),
+        })
+    }
+}
+
+fn read_dataset(args: &EvalArgs) -> Result<Dataset> {
+    let mut dataset = match args.dataset {
+        DatasetKind::Folder => dataset::read_folder(&args.root, &args.pairs, &args.truth)?,
+    };
+    if let Some(limit) = args.limit {
+        dataset.pairs.truncate(limit);
+    }
+    if dataset.pairs.is_empty() {
+        bail!("--limit 0 leaves no pair");
+    }
+    Ok(dataset)
+}
