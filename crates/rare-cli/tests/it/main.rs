@@ -4,6 +4,7 @@
 mod bad_input;
 mod commands;
 mod diffusion;
+mod eval;
 mod features;
 mod options;
 mod outputs;

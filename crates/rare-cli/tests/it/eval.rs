@@ -1,0 +1,179 @@
+//! Evaluations that are interrupted, split and scored.
+
+use std::fs;
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::Duration;
+
+use rare::RigidTransform;
+use rare::nalgebra::{Rotation3, Vector3};
+use rare::random::Random;
+use serde_json::{Value, json};
+
+use crate::shared::{Workplace, argument, pair, shifted, start};
+
+/// Pairs of the benchmark.
+const PAIRS: usize = 6;
+/// The tables of an evaluation, times excluded.
+const TABLES: [&str; 6] =
+    ["tables.txt", "tables.md", "tables.csv", "tables.json", "tables.tex", "pairs.csv"];
+
+/// A benchmark in the folder layout: one reference, several sources, starts of which some are hopeless.
+fn benchmark() -> Workplace {
+    let workplace = Workplace::empty();
+    fs::create_dir(workplace.path("room")).unwrap();
+    let [source, reference] = pair().map(|points| shifted(&points, Vector3::new(0.0, 0.0, 3.0)));
+    workplace.cloud("room/cloud_bin_0.ply", &reference);
+    let (mut pairs, mut starts) = (Vec::new(), Vec::new());
+    for number in 1..=PAIRS {
+        let motion = RigidTransform::new(
+            Rotation3::new(Vector3::new(0.02 * number as f64, 0.1, -0.05)),
+            Vector3::new(0.1, -0.02 * number as f64, 0.05),
+        );
+        let truth = crate::shared::about(&crate::shared::truth(), Vector3::new(0.0, 0.0, 3.0));
+        workplace.cloud(&format!("room/cloud_bin_{number}.ply"), &motion.apply_all(&source));
+        let truth = truth * motion.inverse();
+        let error = if number % 3 == 0 { start() * start() * start() } else { start() };
+        let pose = |pose: &RigidTransform| json!(rare::eval::results::rows_of(&pose.to_matrix()));
+        pairs.push(json!({"src": number, "ref": 0, "gt": pose(&truth), "overlap": 0.9}));
+        starts.push(json!({"src": number, "ref": 0, "init": pose(&(error * truth))}));
+    }
+    workplace.write("room/pairs.json", json!(pairs).to_string());
+    workplace.write("room/init.json", json!({"name": "wrong", "pairs": starts}).to_string());
+    workplace
+}
+
+fn command(workplace: &Workplace, out: &str, more: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rare"));
+    command
+        .args(["eval", "folder", "room", "--init", "init.json", "--out", out, "--threads", "1"])
+        .args(more)
+        .current_dir(argument(&workplace.path(".")))
+        .stdout(Stdio::null())
+        .stderr(Stdio::null());
+    command
+}
+
+fn finish(mut child: Child) {
+    assert!(child.wait().unwrap().success());
+}
+
+#[track_caller]
+fn assert_equal_tables(workplace: &Workplace, first: &str, second: &str) {
+    for table in TABLES {
+        let [a, b] = [first, second].map(|folder| workplace.text(&format!("{folder}/{table}")));
+        assert_eq!(a, b, "{table}");
+    }
+}
+
+fn lines(workplace: &Workplace, out: &str) -> Vec<Value> {
+    let text = fs::read_to_string(workplace.path(out).join("results.jsonl")).unwrap_or_default();
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn killed_split_and_shared_evaluations_give_the_tables_of_an_undisturbed_one() {
+    let workplace = benchmark();
+    finish(command(&workplace, "whole", &[]).spawn().unwrap());
+    let whole = lines(&workplace, "whole");
+    assert_eq!(whole.len(), 2 * PAIRS);
+    let text = workplace.text("whole/tables.txt");
+    assert!(text.contains("refine") && text.contains("6/6"), "{text}");
+
+    // Killed at moments that have nothing to do with what it is doing.
+    let mut random = Random::new(5, 0);
+    for _ in 0..6 {
+        let mut child = command(&workplace, "killed", &[]).spawn().unwrap();
+        thread::sleep(Duration::from_millis(50 + random.below(900) as u64));
+        child.kill().unwrap();
+        child.wait().unwrap();
+    }
+    // And in the middle of a line.
+    let results = workplace.path("killed/results.jsonl");
+    let torn = [fs::read(&results).unwrap_or_default(), b"{\"pair\":1,\"meth".to_vec()].concat();
+    fs::write(&results, torn).unwrap();
+    finish(command(&workplace, "killed", &[]).spawn().unwrap());
+    assert_eq!(lines(&workplace, "killed").len(), 2 * PAIRS);
+    assert_equal_tables(&workplace, "whole", "killed");
+
+    // Two processes in one folder.
+    let both = [0, 1].map(|_| command(&workplace, "both", &["--jobs", "2"]).spawn().unwrap());
+    both.into_iter().for_each(finish);
+    assert_eq!(lines(&workplace, "both").len(), 2 * PAIRS);
+    assert_equal_tables(&workplace, "whole", "both");
+
+    // Four shards.
+    let shards = ["s0", "s1", "s2", "s3"];
+    for (index, out) in shards.iter().enumerate() {
+        let shard = format!("{index}/4");
+        finish(command(&workplace, out, &["--shard", &shard]).spawn().unwrap());
+    }
+    let scored = workplace.run(&[&["score"], &shards[..], &["--out", "merged"]].concat());
+    assert_eq!(scored.code, 0, "{scored:?}");
+    assert_equal_tables(&workplace, "whole", "merged");
+    assert_eq!(scored.stdout, workplace.text("whole/tables.txt"));
+
+    // Unfinished results say so.
+    let part = workplace.run(&["score", "s0"]);
+    assert!(part.stdout.contains("4 pairs have not been tried"), "{part:?}");
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let workplace = benchmark();
+    let eval = |more: &[&str]| {
+        let command = ["eval", "folder", "room", "--init", "init.json", "--methods", "init"];
+        workplace.run(&[&command, more].concat())
+    };
+    assert_eq!(eval(&["--out", "results", "--limit", "2"]).code, 0);
+    eval(&["--out", "results", "--limit", "3"]).assert_refused(&["results", "another folder"]);
+    eval(&[]).assert_refused(&["--out"]);
+    eval(&["--out", "x", "--limit", "0"]).assert_refused(&["--limit"]);
+    eval(&["--out", "x", "--truth", "gt_refined"]).assert_refused(&[
+        "pairs.json",
+        "1 -> 0",
+        "gt_refined",
+    ]);
+    let unknown = workplace.run(&["eval", "folder", "room", "--methods", "magic", "--out", "x"]);
+    unknown.assert_refused(&["magic", "refine"]);
+    let unknown =
+        workplace.run(&["eval", "folder", "room", "--init", "nothing.json", "--out", "x"]);
+    unknown.assert_refused(&["nothing.json"]);
+    workplace.run(&["score", "nowhere"]).assert_refused(&["nowhere"]);
+    workplace.write("results/results.jsonl", "{\"pair\":0}\n");
+    workplace.run(&["score", "results"]).assert_refused(&["results.jsonl", "line 1"]);
+    fs::remove_file(workplace.path("room/cloud_bin_1.ply")).unwrap();
+    eval(&["--out", "x"]).assert_refused(&["cloud_bin_1.ply"]);
+}
+
+#[test]
+fn ten_thousand_pairs_are_scored_at_once() {
+    let workplace = Workplace::empty();
+    let (mut gt, mut info, mut est) = (String::new(), String::new(), String::new());
+    let row =
+        |n: usize, at: usize| (0..n).map(|c| if c == at { "1 " } else { "0 " }).collect::<String>();
+    let block = |n: usize| (0..n).map(|r| row(n, r) + "\n").collect::<String>();
+    for first in 0..100 {
+        for second in 0..100 {
+            let header = format!("{first} {second} 100\n");
+            gt += &(header.clone() + &block(4));
+            est += &(header.clone() + &block(4));
+            info += &(header + &block(6));
+        }
+    }
+    for folder in ["gt/scene", "est/scene"] {
+        fs::create_dir_all(workplace.path(folder)).unwrap();
+    }
+    workplace.write("gt/scene/gt.log", gt);
+    workplace.write("gt/scene/gt.info", info);
+    workplace.write("est/scene/est.log", est);
+    let clock = std::time::Instant::now();
+    let scored = workplace.run(&["score", "--gt", "gt", "--est", "est", "--protocol", "all"]);
+    assert_eq!(scored.code, 0, "{scored:?}");
+    assert!(
+        scored.stdout.contains("10000/10000") && scored.stdout.contains("9702/9702"),
+        "{scored:?}"
+    );
+    // Five protocols take 0.8 s alone on two cores; the limit leaves room for neighbours.
+    assert!(clock.elapsed() < Duration::from_secs(10), "{:?}", clock.elapsed());
+}
