@@ -10,6 +10,7 @@ mod memory;
 mod network;
 mod options;
 mod outputs;
+mod plots;
 mod progress;
 mod record;
 mod run;

@@ -6,6 +6,7 @@
 //! | [`checkpoint`] | weight files, read without executing anything |
 //! | [`cache`] | features that were computed before |
 //! | [`diffusion`] | Stable Diffusion 1.5 with a depth `ControlNet`: features of depth maps |
+//! | [`official`] | fragments and lists of pairs of the official repositories |
 //! | [`weights`] | where weight files come from, and whether they are intact |
 //!
 //! The networks are written once, generic over [`engine::Backend`]; the geometry that uses their features is in the
@@ -15,6 +16,7 @@ pub mod cache;
 pub mod checkpoint;
 pub mod diffusion;
 pub mod engine;
+pub mod official;
 mod parameter;
 pub mod weights;
 

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use rare::eval::Protocol;
+use rare::eval::dataset::KittiTruth;
 
 use crate::options::{Options, choice};
 
@@ -22,6 +23,8 @@ Examples:
   rare eval folder redkitchen --init init_ransac.json --out results
   rare eval folder redkitchen --pairs pairs_lo.json --init sc2-pcr --methods init,refine,gicp --out results
   rare eval folder redkitchen --init init_ransac.json --out results --jobs 4 --shard 0/2
+  rare eval 3dmatch data --init cofinet/5000 --out results
+  rare eval kitti data --limit 20 --out results
 
 Every result is written as soon as it is known: the same command goes on where it was interrupted.";
 
@@ -128,6 +131,9 @@ pub(crate) struct EvalArgs {
     /// The key of the true transform in that list
     #[arg(long, value_name = "KEY", default_value = "gt")]
     pub(crate) truth: String,
+    /// Which truth of KITTI
+    #[arg(long, value_name = "TRUTH", value_enum, default_value_t = KittiGt::Official)]
+    pub(crate) kitti_gt: KittiGt,
     /// Only the first pairs
     #[arg(long, value_name = "N")]
     pub(crate) limit: Option<usize>,
@@ -145,9 +151,36 @@ pub(crate) struct EvalArgs {
 
 /// Layouts of benchmarks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+#[expect(clippy::doc_markdown, reason = "help texts show their words as they are")]
 pub(crate) enum DatasetKind {
-    /// Clouds as PLY, lists of pairs and initial transforms as JSON
+    /// cloud_bin_N.ply, lists of pairs and initial transforms as JSON
     Folder,
+    /// 3DMatch: gt.log and gt.info of each scene, fragments as .pth or .ply
+    #[value(name = "3dmatch")]
+    ThreeDMatch,
+    /// 3DLoMatch: the same with the pairs of 10 to 30 % overlap
+    #[value(name = "3dlomatch")]
+    ThreeDLoMatch,
+    /// KITTI odometry: sequences 8, 9 and 10, scans as velodyne/*.bin
+    Kitti,
+}
+
+/// Which truth of KITTI.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum KittiGt {
+    /// One calibration for all sequences, and the refined transforms of icp/*.npy where they are
+    Official,
+    /// The poses with each sequence's calib.txt
+    Exact,
+}
+
+impl From<KittiGt> for KittiTruth {
+    fn from(truth: KittiGt) -> KittiTruth {
+        match truth {
+            KittiGt::Official => KittiTruth::Official,
+            KittiGt::Exact => KittiTruth::Exact,
+        }
+    }
 }
 
 fn shard(text: &str) -> Result<(usize, usize), String> {

@@ -78,6 +78,9 @@ impl Plan {
 fn read_dataset(args: &EvalArgs) -> Result<Dataset> {
     let mut dataset = match args.dataset {
         DatasetKind::Folder => dataset::read_folder(&args.root, &args.pairs, &args.truth)?,
+        DatasetKind::ThreeDMatch => dataset::read_three_d_match(&args.root, "3DMatch")?,
+        DatasetKind::ThreeDLoMatch => dataset::read_three_d_match(&args.root, "3DLoMatch")?,
+        DatasetKind::Kitti => dataset::read_kitti(&args.root, args.kitti_gt.into())?,
     };
     if let Some(limit) = args.limit {
         dataset.pairs.truncate(limit);

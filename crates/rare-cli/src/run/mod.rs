@@ -17,6 +17,7 @@ use std::path::Path;
 use anyhow::{Context, Result};
 use rare::verify::Verdict;
 use rare::{InitialMethod, Refinement, RigidTransform, Scan, io as files};
+use rare_nets::official;
 use serde::Serialize;
 
 use crate::args::{Cli, Clouds, Command, Direction};
@@ -151,7 +152,9 @@ fn start_threads(settings: &Settings) -> Result<()> {
 }
 
 fn read_scan(file: &Path) -> Result<Scan> {
-    Ok(Scan::from(files::read_cloud(file)?))
+    let is_fragment = official::is_fragment(file);
+    let cloud = if is_fragment { official::read_fragment(file) } else { files::read_cloud(file) };
+    Ok(Scan::from(cloud?))
 }
 
 /// What an error of the registration is about.

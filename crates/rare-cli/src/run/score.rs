@@ -9,7 +9,7 @@ use rare::eval::{Comparison, MethodResult, Protocol, Rules, Success, Table};
 use rare::io::write_whole;
 
 use crate::args::{Format, ProtocolChoice, ScoreArgs, ScoringArgs};
-use crate::{SUCCESS, run};
+use crate::{SUCCESS, plots, run};
 
 pub(super) fn run(args: &ScoreArgs) -> Result<u8> {
     let (methods, protocol) = read(args)?;
@@ -98,7 +98,11 @@ pub(super) fn write_tables(
     ] {
         write_text(&folder.join(name), &in_format(comparisons, format)?)?;
     }
-    write_text(&folder.join("pairs.csv"), &pair_table(methods).to_csv())
+    write_text(&folder.join("pairs.csv"), &pair_table(methods).to_csv())?;
+    match comparisons.first() {
+        Some(comparison) => plots::write_all(folder, methods, comparison.rules.success),
+        None => Ok(()),
+    }
 }
 
 fn write_text(path: &Path, text: &str) -> Result<()> {

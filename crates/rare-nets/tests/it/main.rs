@@ -12,6 +12,7 @@ mod encoder;
 mod engine;
 mod network_shapes;
 mod networks;
+mod official;
 mod pipeline;
 mod reference_backend;
 mod sampler;

@@ -1,11 +1,15 @@
 //! Benchmarks as they lie on disk: which clouds make a pair, and the truth of it.
 
 mod folder;
+mod kitti;
+mod three_d_match;
 
 use std::path::PathBuf;
 
 pub use folder::{read_folder, read_folder_starts};
+pub use kitti::{KittiTruth, read_kitti};
 use nalgebra::Matrix4;
+pub use three_d_match::read_three_d_match;
 
 use super::protocol::Protocol;
 use super::scored::TruePair;

@@ -10,12 +10,13 @@ use anyhow::{Context, Result};
 use rare::eval::dataset::DatasetPair;
 use rare::eval::results::{Estimate, ResultsFolder, rows_of};
 use rare::nalgebra::Matrix4;
-use rare::{Refiner, Scan, io as files};
+use rare::{Refiner, Scan};
 
 use super::Plan;
 use super::method::{Found, Method};
 use super::start::Starts;
 use crate::progress::Pairs;
+use crate::run::read_scan;
 
 /// How long to wait for pairs that other processes work on.
 const PATIENCE: Duration = Duration::from_millis(200);
@@ -132,8 +133,7 @@ struct Loaded {
 
 impl Loaded {
     fn read(pair: &DatasetPair) -> Result<Loaded> {
-        let scan = |path| -> Result<Scan> { Ok(Scan::from(files::read_cloud(path)?)) };
-        Ok(Loaded { source: scan(&pair.source)?, reference: scan(&pair.reference)? })
+        Ok(Loaded { source: read_scan(&pair.source)?, reference: read_scan(&pair.reference)? })
     }
 
     /// The initial transform, or why there is none.

@@ -1,0 +1,153 @@
+//! Fragments and lists of pairs as the official repositories store them.
+
+use std::io::Write;
+
+use rare_nets::official::{is_fragment, read_fragment, read_pairs};
+
+use crate::shared;
+
+#[test]
+fn fragments_of_every_container_are_clouds() {
+    let Some(folder) = shared::path("golden/backbones/pth") else { return };
+    let expected =
+        rare_nets::checkpoint::Parameters::open_safetensors(&[folder.join("expected.safetensors")])
+            .unwrap();
+    let expected = expected.read("fragment_f32", &[50, 3]).unwrap().to_f32();
+    for name in [
+        "fragment_f64_legacy.pth",
+        "fragment_f32_zip.pth",
+        "fragment_tensor_zip.pth",
+        "fragment_tensor_legacy.pth",
+    ] {
+        assert!(is_fragment(&folder.join(name)));
+        let cloud = read_fragment(&folder.join(name)).unwrap();
+        assert_eq!(cloud.len(), 50);
+        for (point, row) in cloud.world_points().iter().zip(expected.chunks_exact(3)) {
+            for axis in 0..3 {
+                assert!(
+                    (point[axis] - f64::from(row[axis])).abs() < 1e-6,
+                    "{name} {point} {row:?}"
+                );
+            }
+        }
+    }
+    for name in ["ckpt_zip.pth", "ckpt_legacy.pth"] {
+        let message = read_fragment(&folder.join(name)).unwrap_err().to_string();
+        assert!(message.contains(name) && message.contains("N x 3"), "{message}");
+    }
+}
+
+/// A pickle of protocol 2, put together from the operations that Python writes.
+struct Pickle(Vec<u8>);
+
+impl Pickle {
+    fn text(mut self, text: &str) -> Pickle {
+        self.0.push(b'X');
+        self.0.extend((text.len() as u32).to_le_bytes());
+        self.0.extend(text.as_bytes());
+        self
+    }
+
+    fn number(mut self, number: f64) -> Pickle {
+        self.0.push(b'G');
+        self.0.extend(number.to_be_bytes());
+        self
+    }
+
+    fn integer(mut self, number: u8) -> Pickle {
+        self.0.extend([b'K', number]);
+        self
+    }
+
+    fn raw(mut self, bytes: &[u8]) -> Pickle {
+        self.0.extend(bytes);
+        self
+    }
+
+    /// `numpy.core.multiarray._reconstruct(ndarray, (0,), b'b')` and its state.
+    fn array(self, shape: &[u8], values: &[f64]) -> Pickle {
+        let mut pickle = self
+            .raw(b"cnumpy.core.multiarray\n_reconstruct\n")
+            .raw(b"cnumpy\nndarray\nK\x00\x85C\x01b\x87R(K\x01(");
+        for &length in shape {
+            pickle = pickle.integer(length);
+        }
+        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let mut pickle = pickle
+            .raw(b"tcnumpy\ndtype\nX\x02\x00\x00\x00f8K\x00K\x01\x87R(K\x03X\x01\x00\x00\x00<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89");
+        pickle.0.push(b'B');
+        pickle.0.extend((bytes.len() as u32).to_le_bytes());
+        pickle.0.extend(bytes);
+        pickle.raw(b"tb")
+    }
+}
+
+const TURN: [f64; 9] = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+
+fn file(pickle: Pickle) -> tempfile::NamedTempFile {
+    let mut file = tempfile::Builder::new().suffix(".pkl").tempfile().unwrap();
+    file.write_all(&[&b"\x80\x03"[..], &pickle.0, b"."].concat()).unwrap();
+    file
+}
+
+#[test]
+fn both_lists_of_pairs_are_read() {
+    let list = Pickle(b"](}(".to_vec())
+        .text("overlap")
+        .number(0.5)
+        .text("pcd0")
+        .text("test/room/cloud_bin_1.pth")
+        .text("pcd1")
+        .text("test/room/cloud_bin_4.pth")
+        .text("rotation")
+        .array(&[3, 3], &TURN)
+        .text("translation")
+        .array(&[3], &[1.0, 2.0, 3.0])
+        .text("scene_name")
+        .text("room")
+        .text("frag_id0")
+        .integer(1)
+        .text("frag_id1")
+        .integer(4)
+        .raw(b"ue");
+    let dictionary = Pickle(b"}(".to_vec())
+        .text("src")
+        .raw(b"](")
+        .text("test/room/cloud_bin_4.pth")
+        .raw(b"e")
+        .text("tgt")
+        .raw(b"](")
+        .text("test/room/cloud_bin_1.pth")
+        .raw(b"e")
+        .text("rot")
+        .raw(b"](")
+        .array(&[3, 3], &TURN)
+        .raw(b"e")
+        .text("trans")
+        .raw(b"](")
+        .array(&[3, 1], &[1.0, 2.0, 3.0])
+        .raw(b"e")
+        .text("overlap")
+        .raw(b"](")
+        .number(0.5)
+        .raw(b"e")
+        .raw(b"u");
+    for pickle in [list, dictionary] {
+        let pairs = read_pairs(file(pickle).path()).unwrap();
+        assert_eq!(pairs.len(), 1);
+        let pair = &pairs[0];
+        assert_eq!(pair.source, "test/room/cloud_bin_4.pth");
+        assert_eq!(pair.reference, "test/room/cloud_bin_1.pth");
+        let truth = &pair.truth;
+        assert_eq!((truth.scene.as_str(), truth.source, truth.reference), ("room", 4, 1));
+        assert_eq!((truth.overlap, truth.is_first_of_scene), (Some(0.5), true));
+        assert_eq!(truth.target_from_source[(0, 1)], -1.0);
+        assert_eq!(truth.target_from_source[(2, 3)], 3.0);
+        assert_eq!(truth.target_from_source[(3, 3)], 1.0);
+    }
+    let lacking = Pickle(b"](}(".to_vec()).text("pcd0").text("a").raw(b"ue");
+    let message = read_pairs(file(lacking).path()).unwrap_err().to_string();
+    assert!(message.contains("pair 0"), "{message}");
+    let message = read_pairs(file(Pickle(b"}".to_vec())).path()).unwrap_err().to_string();
+    assert!(message.contains("no list of pairs"), "{message}");
+}
