@@ -5,6 +5,7 @@
 //! tile by tile, so that two sets of 20 000 keypoints need a few megabytes. Ties go to the lowest index and the
 //! result does not depend on the number of threads.
 
+mod ranked;
 mod search;
 mod window;
 
@@ -12,6 +13,7 @@ use nalgebra::Point3;
 
 use crate::data::{Correspondence, PointFeatures};
 use crate::error::{Error, Result};
+use ranked::ranked;
 use search::{Nearest, search};
 
 /// A pair of keypoints whose features belong together.
@@ -78,6 +80,37 @@ pub fn nearest(
     let Nearest { of_source, .. } = search(source, target, locality, false);
     let pairs = of_source.into_iter().enumerate();
     Ok(pairs.filter_map(|(i, j)| Some(matched(source, target, i, j?))).collect())
+}
+
+/// For every source keypoint the `count` target keypoints with the nearest features (all, if there are fewer), nearest
+/// first; none where its feature is not finite. See [`nearest`] for the precision.
+///
+/// # Errors
+/// `InvalidInput` if the two sets differ in dimension or the dimension is 0.
+///
+/// ```
+/// use rare::{PointFeatures, matching, nalgebra::Point3};
+/// let at = |values: &[f32]| {
+///     let points = values.iter().map(|&x| Point3::new(f64::from(x), 0.0, 1.0)).collect();
+///     PointFeatures::new(points, 1, values.to_vec())
+/// };
+/// let found = matching::nearest_ranked(&at(&[0.3, 0.9])?, &at(&[1.0, 0.25, 2.0, 0.0])?, 3)?;
+/// let indices = |row: &[matching::Match]| row.iter().map(|found| found.target_index).collect();
+/// let indices: Vec<Vec<_>> = found.iter().map(|row| indices(row)).collect();
+/// assert_eq!(indices, [[1, 3, 0], [0, 1, 3]]);
+/// # Ok::<(), rare::Error>(())
+/// ```
+pub fn nearest_ranked(
+    source: &PointFeatures,
+    target: &PointFeatures,
+    count: usize,
+) -> Result<Vec<Vec<Match>>> {
+    check(source, target, None)?;
+    let rows = ranked(source, target, count).into_iter().enumerate();
+    let matches = |(i, row): (usize, Vec<u32>)| {
+        row.into_iter().map(|j| matched(source, target, i, j as usize)).collect()
+    };
+    Ok(rows.map(matches).collect())
 }
 
 /// The pairs of keypoints that are each other's nearest in feature space, in the order of the source keypoints.

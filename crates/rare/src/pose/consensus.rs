@@ -153,7 +153,7 @@ impl Difference {
         Difference { centroid: Point3::from(sum / pairs.len().max(1) as f64), distance }
     }
 
-    fn between(&self, a: &RigidTransform, b: &RigidTransform) -> bool {
+    pub(super) fn between(&self, a: &RigidTransform, b: &RigidTransform) -> bool {
         a.error_to(b).rotation_degrees > DIFFERENT_DEGREES
             || (a.apply(&self.centroid) - b.apply(&self.centroid)).norm() > self.distance
     }

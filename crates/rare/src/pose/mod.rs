@@ -4,20 +4,25 @@ mod consensus;
 mod consistency;
 mod icp;
 mod icp_target;
+mod local_to_global;
 mod normal_equations;
 mod ransac;
 mod rigid_fit;
 mod robust_kernel;
 mod sc2_pcr;
+mod sc2_pcr_plus_plus;
+mod significance;
 mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
 pub use icp::{Icp, IcpResult, IcpStage};
 pub use icp_target::IcpTarget;
-pub use ransac::Ransac;
+pub use local_to_global::LocalToGlobal;
+pub use ransac::{Ransac, RansacScore};
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
 pub use sc2_pcr::{Sc2Pcr, Sc2PcrSeeds};
+pub use sc2_pcr_plus_plus::{FeatureCandidates, Sc2PcrPlusPlus};
 
 use serde::{Deserialize, Serialize};
 
@@ -40,7 +45,8 @@ pub trait PoseEstimator: Send + Sync {
     /// The transform that moves `source` onto `target`, in their local frames, from `pairs` of their points (metres).
     ///
     /// # Errors
-    /// `InvalidInput` if a setting of the estimator makes no sense, `NoPose` if the pairs do not determine a pose.
+    /// `InvalidInput` if a setting of the estimator makes no sense, `NoPose` if the pairs do not determine a pose or
+    /// agree no better than random ones would.
     fn estimate(
         &self,
         source: &PointCloud,

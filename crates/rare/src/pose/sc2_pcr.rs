@@ -3,16 +3,6 @@
 //! Two correspondences are compatible if they keep their distance; the number of correspondences compatible with both
 //! tells inliers from coincidences far better than compatibility alone. Reliable, well spread correspondences become
 //! seeds; around each one the most compatible others give a pose; the pose that most pairs agree with is polished.
-//!
-//! What [`Mode::Faithful`] keeps of the released code:
-//! * seeds are filled up to their exact number with correspondences that are no local maxima,
-//! * a longer set is cut to its first `max_points` in input order,
-//! * the polishing returns its last pose, even if an earlier one was better,
-//! * with fewer than `first_stage` correspondences, both stages keep 4.
-//!
-//! [`Mode::Fixed`]: local maxima alone are seeds, a longer set keeps its best-scored correspondences, the polishing
-//! returns its best pose, small sets use all they have. Not kept in either mode, below a millionth: weights are divided
-//! by their sum plus `1e-6`.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -21,12 +11,25 @@ use crate::data::{Correspondence, KdTree, PointCloud};
 use crate::error::{Error, Result};
 use crate::pose::consensus::{self, Difference, Hypothesis, Keep, Polish};
 use crate::pose::consistency::SoftMatrix;
+use crate::pose::significance;
 use crate::pose::spectral::leading_eigenvector;
 use crate::pose::{
     CompatibilityGraph, Consistency, Mode, PoseEstimate, PoseEstimator, fit_weighted,
 };
 
 /// The settings of SC2-PCR; lengths in metres.
+///
+/// What [`Mode::Faithful`] keeps of the released code:
+/// * seeds are filled up to their exact number with correspondences that are no local maxima,
+/// * a longer set is cut to its first `max_points` in input order,
+/// * the polishing returns its last pose, even if an earlier one was better,
+/// * with fewer than `first_stage` correspondences, both stages keep 4.
+///
+/// [`Mode::Fixed`]: local maxima alone are seeds, a longer set keeps its best-scored correspondences, the polishing
+/// returns its best pose, small sets use all they have.
+///
+/// In both modes the polishing threshold is a setting; the released code takes 0.10 m if the inlier threshold is exactly
+/// that and 1.2 m otherwise. Not kept in either mode, below a millionth: weights are divided by their sum plus `1e-6`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Sc2Pcr {
     /// A correspondence agrees with a pose if its residual is smaller (tau).
@@ -114,23 +117,16 @@ impl Sc2Pcr {
     /// `InvalidInput` if a threshold is not positive or a pair is not finite; `NoPose` if there are fewer than three
     /// pairs or no three of them are consistent.
     pub fn hypotheses(&self, pairs: &[Correspondence], top: usize) -> Result<Vec<PoseEstimate>> {
-        let search = self.search(pairs)?;
-        let seeds = search.seeds().indices;
-        let candidates: Vec<Hypothesis> =
-            seeds.par_iter().filter_map(|&seed| search.pose_around(seed)).collect();
-        let pairs_used = &search.pairs;
+        let SeedPoses { poses, seeds, pairs: pairs_used } = self.seed_poses(pairs)?;
+        let pairs_used = &pairs_used;
         let difference = Difference::new(pairs_used, 2.0 * self.inlier_threshold);
-        let polished = (difference.best(candidates, top).into_iter())
+        let polished = (difference.best(poses, top).into_iter())
             .map(|candidate| self.polish().run(candidate.target_from_source, pairs_used))
             .map(|pose| Hypothesis::new(pose, pairs_used, self.inlier_threshold))
             .collect();
         let best = difference.best(polished, top);
         if best.is_empty() && top > 0 {
-            return Err(Error::no_pose(format!(
-                "no three of {} correspondences are consistent within {} m",
-                pairs.len(),
-                self.compatibility_threshold
-            )));
+            return Err(self.nothing_consistent(pairs));
         }
         Ok((best.iter().enumerate())
             .map(|(rank, hypothesis)| PoseEstimate {
@@ -142,7 +138,7 @@ impl Sc2Pcr {
                 ),
                 score: hypothesis.score,
                 runner_up: best.get(rank + 1).map(|next| next.score),
-                iterations: seeds.len(),
+                iterations: seeds,
                 budget_exhausted: pairs_used.len() < pairs.len(),
             })
             .collect())
@@ -155,6 +151,22 @@ impl Sc2Pcr {
     /// As [`Sc2Pcr::hypotheses`].
     pub fn seeds(&self, pairs: &[Correspondence]) -> Result<Sc2PcrSeeds> {
         Ok(self.search(pairs)?.seeds())
+    }
+
+    /// The poses around all seeds, best seed first, unpolished and scored by the pairs that agree.
+    pub(super) fn seed_poses(&self, pairs: &[Correspondence]) -> Result<SeedPoses> {
+        let search = self.search(pairs)?;
+        let seeds = search.seeds().indices;
+        let poses = seeds.par_iter().filter_map(|&seed| search.pose_around(seed)).collect();
+        Ok(SeedPoses { poses, seeds: seeds.len(), pairs: search.pairs })
+    }
+
+    pub(super) fn nothing_consistent(&self, pairs: &[Correspondence]) -> Error {
+        Error::no_pose(format!(
+            "no three of {} correspondences are consistent within {} m",
+            pairs.len(),
+            self.compatibility_threshold
+        ))
     }
 
     fn search<'a>(&'a self, pairs: &'a [Correspondence]) -> Result<Search<'a>> {
@@ -180,7 +192,7 @@ impl Sc2Pcr {
         Ok(())
     }
 
-    fn polish(&self) -> Polish {
+    pub(super) fn polish(&self) -> Polish {
         Polish {
             threshold: self.polish_threshold,
             rounds: self.polish_rounds,
@@ -193,7 +205,7 @@ impl Sc2Pcr {
 }
 
 impl PoseEstimator for Sc2Pcr {
-    /// Uses the pairs alone.
+    /// Uses the pairs alone; `NoPose` also if no more of them agree than random ones would.
     fn estimate(
         &self,
         _source: &PointCloud,
@@ -201,7 +213,11 @@ impl PoseEstimator for Sc2Pcr {
         pairs: &[Correspondence],
     ) -> Result<PoseEstimate> {
         let best = self.hypotheses(pairs, 2)?.into_iter().next();
-        best.ok_or_else(|| Error::Internal("sc2-pcr gave neither a pose nor an error".to_owned()))
+        let best = best.ok_or_else(|| {
+            Error::Internal("sc2-pcr gave neither a pose nor an error".to_owned())
+        })?;
+        significance::require(&best.target_from_source, pairs, self.inlier_threshold)?;
+        Ok(best)
     }
 }
 
@@ -212,6 +228,15 @@ pub struct Sc2PcrSeeds {
     pub confidences: Vec<f64>,
     /// Indices of the correspondences around which poses are formed, most confident first.
     pub indices: Vec<usize>,
+}
+
+/// What comes of the seeds.
+pub(super) struct SeedPoses {
+    pub(super) poses: Vec<Hypothesis>,
+    /// The number of seeds; not each one gives a pose.
+    pub(super) seeds: usize,
+    /// The pairs that were used, with scores as they weigh.
+    pub(super) pairs: Vec<Correspondence>,
 }
 
 /// The compatibilities of one set of pairs.

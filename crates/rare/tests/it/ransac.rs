@@ -1,7 +1,7 @@
 //! RANSAC on synthetic correspondences.
 
-use rare::pose::{PoseEstimator, Ransac};
-use rare::{Correspondence, PointCloud};
+use rare::pose::{Mode, PoseEstimator, Ransac, RansacScore};
+use rare::{Correspondence, PointCloud, RigidTransform};
 
 use crate::synthetic_pairs::{estimate, motion, synthetic};
 
@@ -21,8 +21,9 @@ fn outliers_are_survived() {
 
 #[test]
 fn the_budget_is_kept_and_reported() {
-    let pairs = synthetic(500, 0.02, &motion(), 3);
-    let result = estimate(&Ransac { max_iterations: 1500, ..Ransac::three_d_match() }, &pairs);
+    let pairs = synthetic(500, 0.3, &motion(), 3);
+    let settings = Ransac { max_iterations: 1500, confidence: 1.0, ..Ransac::three_d_match() };
+    let result = estimate(&settings, &pairs);
     assert!(result.budget_exhausted);
     assert_eq!(result.iterations, 1500);
 }
@@ -59,4 +60,63 @@ fn what_makes_no_sense_is_an_error() {
         let message = settings.estimate(&cloud, &cloud, pairs).unwrap_err().to_string();
         assert!(message.contains(word), "{message}");
     }
+}
+
+#[test]
+fn clouds_decide_where_that_is_asked_for() {
+    // More pairs follow a wrong motion, but the clouds are those of the right one.
+    let wrong = RigidTransform::from_translation(nalgebra::Vector3::new(0.0, 1.0, 0.0)) * motion();
+    let mut pairs = synthetic(60, 1.0, &wrong, 3);
+    pairs.extend(synthetic(50, 1.0, &motion(), 4));
+    let source: Vec<_> = synthetic(400, 1.0, &motion(), 5).iter().map(|pair| pair.source).collect();
+    let target = PointCloud::new(motion().apply_all(&source)).unwrap();
+    let source = PointCloud::new(source).unwrap();
+    for (score, truth) in
+        [(RansacScore::Correspondences, wrong), (RansacScore::CloudFitness, motion())]
+    {
+        for mode in [Mode::Faithful, Mode::Fixed] {
+            let settings = Ransac { score, mode, ..Ransac::three_d_match() };
+            let found = settings.estimate(&source, &target, &pairs).unwrap();
+            let error = found.target_from_source.error_to(&truth);
+            assert!(error.translation < 0.02, "{score:?} {mode:?} {error:?}");
+            let expected = if score == RansacScore::CloudFitness { 400.0 } else { 60.0 };
+            assert_eq!(found.score.floor(), expected);
+        }
+    }
+}
+
+#[test]
+fn a_sample_whose_own_residuals_are_too_large_is_dropped() {
+    // Edges agree within a tenth, but not to a centimetre.
+    let stretched: Vec<_> = (synthetic(30, 1.0, &RigidTransform::identity(), 6).iter())
+        .map(|pair| Correspondence { target: pair.target * 1.08, ..*pair })
+        .collect();
+    let cloud = PointCloud::new(stretched.iter().map(|pair| pair.source).collect()).unwrap();
+    let settings = Ransac { inlier_threshold: 0.02, ..Ransac::three_d_match() };
+    let message = |check_residuals| {
+        let settings = Ransac { check_residuals, max_iterations: 1000, ..settings.clone() };
+        settings.estimate(&cloud, &cloud, &stretched).unwrap_err().to_string()
+    };
+    assert!(message(true).contains("none of 1000 samples"), "{}", message(true));
+    assert!(message(false).contains("random ones"), "{}", message(false));
+}
+
+#[test]
+fn faithful_samples_repeat_correspondences() {
+    // Of three pairs, two ninths of all samples with replacement have three different ones.
+    let pairs = synthetic(3, 1.0, &motion(), 7);
+    let run = |mode| {
+        let settings =
+            Ransac { mode, max_iterations: 1, sample_size: 3, ..Ransac::three_d_match() };
+        (0..30)
+            .map(|seed| Ransac { seed, ..settings.clone() })
+            .filter(|settings| {
+                let cloud = PointCloud::new(vec![pairs[0].source]).unwrap();
+                let found = settings.estimate(&cloud, &cloud, &pairs);
+                found.is_err_and(|error| error.to_string().contains("none of 1 samples"))
+            })
+            .count()
+    };
+    assert_eq!(run(Mode::Fixed), 0);
+    assert!((15..30).contains(&run(Mode::Faithful)));
 }
