@@ -2,8 +2,10 @@
 
 mod consensus;
 mod consistency;
+mod fast_mac;
 mod icp;
 mod icp_target;
+mod mac;
 mod normal_equations;
 mod ransac;
 mod rigid_fit;
@@ -12,8 +14,10 @@ mod sc2_pcr;
 mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
+pub use fast_mac::FastMac;
 pub use icp::{Icp, IcpResult, IcpStage};
 pub use icp_target::IcpTarget;
+pub use mac::{FirstOrderScore, Mac};
 pub use ransac::Ransac;
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;

@@ -14,6 +14,7 @@ mod encoded_views;
 mod fpfh;
 mod hint;
 mod hostile_files;
+mod mac;
 mod matching;
 mod metrics;
 mod poses;
