@@ -11,6 +11,7 @@ mod ransac;
 mod rigid_fit;
 mod robust_kernel;
 mod sc2_pcr;
+mod significance;
 mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
@@ -44,7 +45,8 @@ pub trait PoseEstimator: Send + Sync {
     /// The transform that moves `source` onto `target`, in their local frames, from `pairs` of their points (metres).
     ///
     /// # Errors
-    /// `InvalidInput` if a setting of the estimator makes no sense, `NoPose` if the pairs do not determine a pose.
+    /// `InvalidInput` if a setting of the estimator makes no sense, `NoPose` if the pairs do not determine a pose or
+    /// agree no better than random ones would.
     fn estimate(
         &self,
         source: &PointCloud,

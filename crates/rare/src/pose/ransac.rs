@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::data::{Correspondence, PointCloud};
 use crate::error::{Error, Result};
 use crate::pose::consensus::{self, Difference, Hypothesis, Keep, Polish};
-use crate::pose::{PoseEstimate, PoseEstimator, fit_weighted};
+use crate::pose::{PoseEstimate, PoseEstimator, fit_weighted, significance};
 use crate::random::Random;
 
 /// Iterations between two looks at the stopping rule; independent of the number of threads.
@@ -154,7 +154,7 @@ impl Ransac {
 }
 
 impl PoseEstimator for Ransac {
-    /// Uses the pairs alone.
+    /// Uses the pairs alone; `NoPose` also if no more of them agree than random ones would.
     fn estimate(
         &self,
         _source: &PointCloud,
@@ -178,6 +178,7 @@ impl PoseEstimator for Ransac {
                 pairs.len()
             )));
         };
+        significance::require(&best.target_from_source, pairs, self.inlier_threshold)?;
         Ok(PoseEstimate {
             target_from_source: best.target_from_source,
             inliers: consensus::inliers(&best.target_from_source, pairs, self.inlier_threshold),

@@ -21,6 +21,7 @@ use crate::data::{Correspondence, KdTree, PointCloud};
 use crate::error::{Error, Result};
 use crate::pose::consensus::{self, Difference, Hypothesis, Keep, Polish};
 use crate::pose::consistency::SoftMatrix;
+use crate::pose::significance;
 use crate::pose::spectral::leading_eigenvector;
 use crate::pose::{
     CompatibilityGraph, Consistency, Mode, PoseEstimate, PoseEstimator, fit_weighted,
@@ -193,7 +194,7 @@ impl Sc2Pcr {
 }
 
 impl PoseEstimator for Sc2Pcr {
-    /// Uses the pairs alone.
+    /// Uses the pairs alone; `NoPose` also if no more of them agree than random ones would.
     fn estimate(
         &self,
         _source: &PointCloud,
@@ -201,7 +202,11 @@ impl PoseEstimator for Sc2Pcr {
         pairs: &[Correspondence],
     ) -> Result<PoseEstimate> {
         let best = self.hypotheses(pairs, 2)?.into_iter().next();
-        best.ok_or_else(|| Error::Internal("sc2-pcr gave neither a pose nor an error".to_owned()))
+        let best = best.ok_or_else(|| {
+            Error::Internal("sc2-pcr gave neither a pose nor an error".to_owned())
+        })?;
+        significance::require(&best.target_from_source, pairs, self.inlier_threshold)?;
+        Ok(best)
     }
 }
 

@@ -21,8 +21,9 @@ fn outliers_are_survived() {
 
 #[test]
 fn the_budget_is_kept_and_reported() {
-    let pairs = synthetic(500, 0.02, &motion(), 3);
-    let result = estimate(&Ransac { max_iterations: 1500, ..Ransac::three_d_match() }, &pairs);
+    let pairs = synthetic(500, 0.3, &motion(), 3);
+    let settings = Ransac { max_iterations: 1500, confidence: 1.0, ..Ransac::three_d_match() };
+    let result = estimate(&settings, &pairs);
     assert!(result.budget_exhausted);
     assert_eq!(result.iterations, 1500);
 }
