@@ -159,6 +159,12 @@ impl CompatibilityGraph {
         ones(self.row(i))
     }
 
+    /// Number of neighbours of `i`, `i` not among them.
+    #[must_use]
+    pub fn degree(&self, i: usize) -> u32 {
+        self.row(i).iter().map(|word| word.count_ones()).sum::<u32>().saturating_sub(1)
+    }
+
     /// How many neighbours `i` and `j` share.
     #[must_use]
     pub fn common(&self, i: usize, j: usize) -> u32 {
@@ -287,6 +293,7 @@ mod tests {
                 let joined = |threshold| (0..count).filter(move |&j| difference(i, j) < threshold);
                 assert!(loose.neighbours(i).eq(joined(0.8)));
                 assert!(tight.neighbours(i).eq(joined(0.4)));
+                assert_eq!(tight.degree(i) as usize, joined(0.4).count() - 1);
                 let shared = joined(0.4).filter(|&j| difference(0, j) < 0.4).count();
                 assert_eq!(tight.common(0, i) as usize, shared);
                 let soft = |j| (1.0 - (difference(i, j) / 0.8_f64).powi(2)).max(0.0);

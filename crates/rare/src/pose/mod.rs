@@ -2,9 +2,11 @@
 
 mod consensus;
 mod consistency;
+mod fast_mac;
 mod icp;
 mod icp_target;
 mod local_to_global;
+mod mac;
 mod normal_equations;
 mod ransac;
 mod rigid_fit;
@@ -15,9 +17,11 @@ mod significance;
 mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
+pub use fast_mac::FastMac;
 pub use icp::{Icp, IcpResult, IcpStage};
 pub use icp_target::IcpTarget;
 pub use local_to_global::LocalToGlobal;
+pub use mac::{FirstOrderScore, Mac};
 pub use ransac::{Ransac, RansacScore};
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;

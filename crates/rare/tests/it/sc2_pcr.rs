@@ -8,7 +8,7 @@ use crate::shared::Golden;
 use crate::synthetic_pairs::{estimate, motion, synthetic};
 
 /// 1000 nearest-neighbour FPFH matches of a real indoor pair, and the true pose.
-fn real_matches() -> Option<(Vec<Correspondence>, RigidTransform)> {
+pub(crate) fn real_matches() -> Option<(Vec<Correspondence>, RigidTransform)> {
     let mut golden = Golden::open("estimators/corr_fpfh_1000.npz")?;
     let pairs = (golden.array("src").points().into_iter())
         .zip(golden.array("ref").points())
