@@ -12,8 +12,8 @@ mod sc2_pcr;
 mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
-pub use icp::{Icp, IcpResult, IcpStage};
-pub use icp_target::IcpTarget;
+pub use icp::{Icp, IcpMethod, IcpResult, IcpStage, MultiScaleIcp, OpenDirection, Trim};
+pub use icp_target::{IcpSource, IcpTarget};
 pub use ransac::Ransac;
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
