@@ -21,11 +21,12 @@ pub struct MultiScaleIcp {
 }
 
 impl MultiScaleIcp {
-    /// Three scales that end at `voxel` (metres), each twice as fine as the one before, with [`Icp::for_method`].
+    /// Twice `voxel` (metres), then `voxel`, with [`Icp::for_method`]. A coarser scale would reach so far that parts
+    /// without a counterpart pull at low overlap.
     #[must_use]
     pub fn for_voxel(method: IcpMethod, voxel: f64) -> MultiScaleIcp {
         MultiScaleIcp {
-            voxels: vec![4.0 * voxel, 2.0 * voxel, voxel],
+            voxels: vec![2.0 * voxel, voxel],
             per_voxel: Icp::for_method(method, 1.0),
             neighbours: 20,
             gaussian_voxel: 4.0,

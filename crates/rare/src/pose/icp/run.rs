@@ -16,8 +16,11 @@ use crate::pose::{IcpTarget, RobustKernel};
 /// Points per unit of parallel work; independent of the number of threads, so that sums are too.
 const CHUNK: usize = 1024;
 
-/// How far a search looks beyond the nearest point, as a share of the largest distance of a pair.
-const MARGIN: f64 = 0.1;
+/// How far a search looks beyond the nearest point: so many times as far as the point has come since the last search,
+/// which is about how far it will go until the alignment is at rest, ...
+const MARGIN: f64 = 2.0;
+/// ... within these shares of the largest distance of a pair.
+const MARGIN_SHARES: [f64; 2] = [0.01, 0.1];
 
 /// Guards a comparison of distances against the rounding of their square roots.
 const ROUNDING: f64 = 1.0 - 1e-12;
@@ -50,6 +53,13 @@ struct Match {
     clearance: f64,
 }
 
+/// Where partners are sought.
+struct Search<'a> {
+    target: &'a IcpTarget,
+    max_distance: f64,
+    spread: f64,
+}
+
 /// How many pairs were matched, and the sum of their squared distances.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Fit {
@@ -70,28 +80,36 @@ impl Match {
         clearance: f64::NEG_INFINITY,
     };
 
+    fn is_unsought(&self) -> bool {
+        self.clearance == f64::NEG_INFINITY
+    }
+
     /// Finds the nearest point closer than `max_distance`.
-    fn with_point(&mut self, moved: Point3<f64>, target: &IcpTarget, max_distance: f64) {
-        let guess = Neighbour::of(target.points(), self.partner as usize, &moved);
-        let travelled = (moved - self.searched_at).norm();
+    fn with_point(&mut self, moved: Point3<f64>, search: &Search<'_>) {
+        let max_distance = search.max_distance;
+        let guess = Neighbour::of(search.target.points(), self.partner as usize, &moved);
+        let travelled = if self.is_unsought() { 0.0 } else { (moved - self.searched_at).norm() };
         let others = self.clearance * ROUNDING - travelled;
         let distance = guess.map_or(f64::INFINITY, |guess| guess.squared_distance.sqrt());
         self.moved = moved;
         let known = distance < others || (distance > max_distance && others > max_distance);
-        let nearest = if known { guess } else { self.search(guess, target, max_distance) };
+        let nearest = if known { guess } else { self.sought(guess, travelled, search) };
         let within = nearest.filter(|n| n.squared_distance < max_distance * max_distance);
         self.squared_distance = within.map_or(f64::INFINITY, |nearest| nearest.squared_distance);
     }
 
-    fn search(
+    fn sought(
         &mut self,
         guess: Option<Neighbour>,
-        target: &IcpTarget,
-        max_distance: f64,
+        travelled: f64,
+        search: &Search<'_>,
     ) -> Option<Neighbour> {
-        let margin = MARGIN * max_distance;
+        let [least, most] =
+            MARGIN_SHARES.map(|share| share * search.max_distance.min(search.spread));
+        let margin = (MARGIN * travelled).clamp(least, most);
+        let radius = search.max_distance + margin;
         let (nearest, clearance) =
-            target.tree().nearest_with_clearance(&self.moved, guess, max_distance + margin, margin);
+            search.target.tree().nearest_with_clearance(&self.moved, guess, radius, margin);
         self.searched_at = self.moved;
         self.clearance = clearance;
         self.partner = nearest.map_or(self.partner, |nearest| nearest.index as u32);
@@ -164,15 +182,22 @@ impl<'a> Run<'a> {
     }
 
     fn match_points(&mut self, pose: &RigidTransform, stage: &IcpStage) {
-        let target = self.target;
-        self.match_each(pose, |found, moved| found.with_point(moved, target, stage.max_distance));
+        let (target, spread) = (self.target, self.spread);
+        let search = Search { target, max_distance: stage.max_distance, spread };
+        self.match_each(pose, |found, moved| found.with_point(moved, &search));
     }
 
     fn match_each(&mut self, pose: &RigidTransform, find: impl Fn(&mut Match, Point3<f64>) + Sync) {
         let chunks = self.points.par_chunks(CHUNK).zip(self.matches.par_chunks_mut(CHUNK));
         chunks.for_each(|(points, matches)| {
+            let mut neighbour = 0;
             for (point, found) in points.iter().zip(matches) {
+                // Points that follow one another are often close.
+                if found.is_unsought() {
+                    found.partner = neighbour;
+                }
                 find(found, pose.apply(point));
+                neighbour = found.partner;
             }
         });
     }
