@@ -105,6 +105,41 @@ impl KdTree {
         self.first_before(point, guess).unwrap_or(guess)
     }
 
+    /// The point closest to `point` among those closer than `radius` (metres), as [`KdTree::nearest_within`], and its
+    /// clearance: no other point is closer than that, metres. The clearance ends `margin` beyond the point found, or at
+    /// `radius`. `guess` (its true distance to `point`) shortens the search.
+    pub(crate) fn nearest_with_clearance(
+        &self,
+        point: &Point3<f64>,
+        guess: Option<Neighbour>,
+        radius: f64,
+        margin: f64,
+    ) -> (Option<Neighbour>, f64) {
+        let capped = |nearest: &Neighbour| (nearest.squared_distance.sqrt() + margin).powi(2);
+        let squared_radius = radius * radius;
+        let mut nearest = guess.filter(|guess| guess.squared_distance < squared_radius);
+        let mut clearance = nearest.as_ref().map_or(squared_radius, capped).min(squared_radius);
+        let bound = Neighbour { index: 0, squared_distance: clearance };
+        self.search(point, bound, |candidate, bound| {
+            match nearest {
+                Some(known) if known.index == candidate.index => return,
+                Some(known) if known.precedes(&candidate) => {
+                    clearance = clearance.min(candidate.squared_distance);
+                }
+                _ => {
+                    let other = nearest.map_or(f64::INFINITY, |known| known.squared_distance);
+                    clearance = clearance.min(other).min(capped(&candidate));
+                    nearest = Some(candidate);
+                }
+            }
+            // At exactly the same distance a lower index would still win.
+            let tied = nearest.filter(|nearest| nearest.squared_distance == clearance);
+            let index = tied.map_or(0, |nearest| nearest.index);
+            *bound = Neighbour { index, squared_distance: clearance };
+        });
+        (nearest, clearance.sqrt())
+    }
+
     /// The `k` closest points among those closer than `radius` (metres), by distance, then index. Replaces the
     /// content of `found`.
     pub fn k_nearest_within(
@@ -304,6 +339,14 @@ mod tests {
             prop_assert_eq!(tree.nearest_within(&query, radius), near.first().copied());
             if let Some(&guess) = all.get(k) {
                 prop_assert_eq!(tree.nearest_from(&query, guess), all[0]);
+            }
+            let margin = 0.07;
+            for guess in [None, all.get(k).copied()] {
+                let (nearest, clearance) = tree.nearest_with_clearance(&query, guess, radius, margin);
+                prop_assert_eq!(nearest, near.first().copied());
+                let end = nearest.map_or(radius, |nearest| nearest.squared_distance.sqrt() + margin);
+                let other = near.get(1).map_or(radius, |other| other.squared_distance.sqrt());
+                prop_assert!((clearance - end.min(other)).abs() < 1e-12);
             }
         }
     }

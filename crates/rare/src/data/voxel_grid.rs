@@ -24,27 +24,12 @@ const RESOLUTION_SAMPLE: usize = 1000;
 /// # Errors
 /// `InvalidInput` if `voxel` is not a positive number, or so small that the cloud spans more than `2^32` voxels.
 pub fn voxel_downsample(points: &[Point3<f64>], voxel: f64) -> Result<Vec<Point3<f64>>> {
-    if !(voxel.is_finite() && voxel > 0.0) {
-        return Err(Error::invalid(format!("the voxel size is {voxel} m, it must be positive")));
-    }
-    if points.is_empty() {
-        return Ok(Vec::new());
-    }
-    let (low, high) = bounds(points);
-    let extent = (high - low).amax();
-    let spanned = extent / voxel;
-    if spanned.is_nan() || spanned >= CELLS_PER_AXIS - 1.0 {
-        return Err(Error::invalid(format!(
-            "the cloud spans {extent} m, too much for voxels of {voxel} m: remove stray points or use voxels of at least {:.1e} m",
-            extent / CELLS_PER_AXIS * 2.0
-        )));
-    }
-    let anchor = low - Vector3::repeat(voxel * 0.5);
+    let grid = VoxelGrid::over(points, voxel)?;
     // The map is only asked, never iterated: its order cannot show.
     let mut slots = HashMap::<Cell, u32, BuildHasherDefault<CellHasher>>::default();
     let mut sums: Vec<(Vector3<f64>, f64)> = Vec::new();
     for point in points {
-        let cell = Cell::of(&((point - anchor) / voxel));
+        let cell = grid.cell(point);
         let slot = *slots.entry(cell).or_insert(sums.len() as u32) as usize;
         match sums.get_mut(slot) {
             Some((sum, count)) => {
@@ -81,9 +66,55 @@ pub fn resolution(points: &[Point3<f64>]) -> f64 {
     distances.select_nth_unstable_by(middle, f64::total_cmp).1.sqrt()
 }
 
+/// Cubes that cover some points, anchored half an edge below their lowest corner.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct VoxelGrid {
+    anchor: Point3<f64>,
+    voxel: f64,
+}
+
+impl VoxelGrid {
+    /// The grid with edges of `voxel` metres over `points`.
+    ///
+    /// # Errors
+    /// As [`voxel_downsample`].
+    pub(crate) fn over(points: &[Point3<f64>], voxel: f64) -> Result<VoxelGrid> {
+        if !(voxel.is_finite() && voxel > 0.0) {
+            return Err(Error::invalid(format!(
+                "the voxel size is {voxel} m, it must be positive"
+            )));
+        }
+        if points.is_empty() {
+            return Ok(VoxelGrid { anchor: Point3::origin(), voxel });
+        }
+        let (low, high) = bounds(points);
+        let extent = (high - low).amax();
+        let spanned = extent / voxel;
+        if spanned.is_nan() || spanned >= CELLS_PER_AXIS - 1.0 {
+            return Err(Error::invalid(format!(
+                "the cloud spans {extent} m, too much for voxels of {voxel} m: remove stray points or use voxels of at least {:.1e} m",
+                extent / CELLS_PER_AXIS * 2.0
+            )));
+        }
+        Ok(VoxelGrid { anchor: low - Vector3::repeat(voxel * 0.5), voxel })
+    }
+
+    /// The voxel that holds one of the points of the grid.
+    pub(crate) fn cell(&self, point: &Point3<f64>) -> Cell {
+        Cell::of(&((point - self.anchor) / self.voxel))
+    }
+
+    /// The voxel that holds any point; `None` outside the grid.
+    pub(crate) fn cell_of_any(&self, point: &Point3<f64>) -> Option<Cell> {
+        let position = (point - self.anchor) / self.voxel;
+        let inside = position.iter().all(|value| (0.0..CELLS_PER_AXIS).contains(value));
+        inside.then(|| Cell::of(&position))
+    }
+}
+
 /// A voxel: x and y in one word, z in another.
-#[derive(PartialEq, Eq, Hash)]
-struct Cell(u64, u32);
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) struct Cell(u64, u32);
 
 impl Cell {
     /// The voxel that holds `position`, given in voxels from the anchor, each coordinate below `2^32`.
@@ -95,7 +126,7 @@ impl Cell {
 
 /// A fast hash for [`Cell`]: the default one costs more than everything else here together.
 #[derive(Default)]
-struct CellHasher(u64);
+pub(crate) struct CellHasher(u64);
 
 impl Hasher for CellHasher {
     fn write(&mut self, bytes: &[u8]) {

@@ -18,8 +18,8 @@ mod spectral;
 
 pub use consistency::{CompatibilityGraph, Consistency};
 pub use fast_mac::FastMac;
-pub use icp::{Icp, IcpResult, IcpStage};
-pub use icp_target::IcpTarget;
+pub use icp::{Icp, IcpMethod, IcpResult, IcpStage, MultiScaleIcp, OpenDirection, Trim};
+pub use icp_target::{IcpSource, IcpTarget};
 pub use local_to_global::LocalToGlobal;
 pub use mac::{FirstOrderScore, Mac};
 pub use ransac::{Ransac, RansacScore};

@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RobustKernel {
+    /// `1` everywhere: least squares.
+    None,
     /// `(1 - (r/k)^2)^2`, 0 from `k` on: wrong pairs lose all influence.
     Tukey,
     /// `1` up to `k`, then `k/|r|`.
@@ -22,6 +24,7 @@ impl RobustKernel {
     pub fn weight(self, residual: f64, width: f64) -> f64 {
         let square = (residual / width).powi(2);
         match self {
+            RobustKernel::None => 1.0,
             RobustKernel::Tukey => (1.0 - square.min(1.0)).powi(2),
             RobustKernel::Huber => width / residual.abs().max(width),
             RobustKernel::Cauchy => 1.0 / (1.0 + square),
@@ -37,6 +40,7 @@ mod tests {
     #[test]
     fn weights_fall_from_one_as_documented() {
         for (kernel, at_half, at_double) in [
+            (RobustKernel::None, 1.0, 1.0),
             (RobustKernel::Tukey, 0.5625, 0.0),
             (RobustKernel::Huber, 1.0, 0.5),
             (RobustKernel::Cauchy, 0.8, 0.2),

@@ -148,6 +148,7 @@ fn schedule(voxel: f64, reaches: &[f64], tolerance: f64) -> Icp {
         // At the edge of a scan 30 voxels from its middle both count alike.
         rotation_tolerance: tolerance / 30.0,
         translation_tolerance: tolerance * voxel,
+        ..Icp::for_voxel(voxel)
     }
 }
 
