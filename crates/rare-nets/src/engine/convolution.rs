@@ -11,16 +11,17 @@ use rare::{Error, Result};
 use rayon::prelude::*;
 
 use super::arena::Arena;
-use super::backend::{Activation, Arrangement, Convolution, Prologue, Shape};
+use super::backend::{Convolution, Prologue, Shape};
 use super::cpu::Precision;
-use super::math::{gelu, sigmoid_linear};
+use super::epilogue::Epilogue;
 use super::operand::{Layout, Preparation};
 use super::pack::{PANEL, PackedWeight};
 use super::shared_output::SharedOutput;
 use super::simd::{LANES, Processor, Simd, Vectorized};
 use super::tensor::{Elements, Tensor};
 use super::tile::{Segment, Tile};
-use super::vectors::{Element, load, store};
+use super::vectors::Element;
+use super::winograd::{self, Winograd};
 
 /// Rows of a chunk: a multiple of the rows of the register tiles (14, 6, 2), small enough to keep all threads busy.
 const CHUNK_ROWS: usize = 336;
@@ -61,20 +62,40 @@ pub(super) fn convolve(
         )));
     }
     let operand = preparation.prepare(input);
-    let geometry = Geometry::new(input, weight, fused, layout);
-    let shape = geometry.shape;
+    let shape = result(input, weight, fused, layout);
     let elements = match (precision, fused.intermediate) {
         (Precision::Bf16, true) => Elements::Bf16,
         _ => Elements::F32,
     };
     let mut buffer = arena.lend(shape.values() * elements.bytes());
     let epilogue = Epilogue::new(weight, fused, shape)?;
-    let product = Product { context, operand: operand.units(), weight, geometry: &geometry };
+    let operand = operand.units();
+    let upsampled = fused.upsample;
+    if winograd::pays(weight, fused.stride, shape, upsampled) {
+        let winograd = Winograd { context, operand, layout, weight, shape, upsampled };
+        winograd.compute(&epilogue, buffer.slice_mut());
+        return Ok(Tensor { shape, elements, buffer });
+    }
+    let geometry = Geometry::new(weight, fused.stride, layout, shape);
+    let product = Product { context, operand, weight, geometry: &geometry };
     match elements {
         Elements::F32 => product.compute::<f32>(&epilogue, buffer.slice_mut()),
         Elements::Bf16 => product.compute::<bf16>(&epilogue, buffer.slice_mut()),
     }
     Ok(Tensor { shape, elements, buffer })
+}
+
+/// The shape of the result.
+fn result(
+    input: &Tensor,
+    weight: &PackedWeight,
+    fused: &Convolution<'_, Tensor>,
+    layout: Layout,
+) -> Shape {
+    let border = weight.side / 2;
+    let size = |padded: usize| (padded - 2 * border).div_ceil(fused.stride);
+    let (height, width) = (size(layout.height), size(layout.width));
+    Shape { batch: input.shape.batch, height, width, channels: weight.outputs }
 }
 
 fn check(
@@ -126,22 +147,14 @@ struct Block {
 }
 
 impl Geometry {
-    fn new(
-        input: &Tensor,
-        weight: &PackedWeight,
-        fused: &Convolution<'_, Tensor>,
-        layout: Layout,
-    ) -> Geometry {
-        let border = weight.side / 2;
-        let size = |padded: usize| (padded - 2 * border).div_ceil(fused.stride);
-        let (height, width) = (size(layout.height), size(layout.width));
-        let shape = Shape { batch: input.shape.batch, height, width, channels: weight.outputs };
+    fn new(weight: &PackedWeight, stride: usize, layout: Layout, shape: Shape) -> Geometry {
+        let (height, width) = (shape.height, shape.width);
         let pixel = |image: usize, y: usize, x: usize| {
             (((image * layout.height + y) * layout.width + x) * layout.units) as u32
         };
         let row = |index: usize| {
             let (image, y, x) = (index / (height * width), index / width % height, index % width);
-            pixel(image, y * fused.stride, x * fused.stride)
+            pixel(image, y * stride, x * stride)
         };
         let tap = |tap: usize| pixel(0, tap / weight.side, tap % weight.side);
         Geometry {
@@ -247,111 +260,4 @@ impl<T: Element> Vectorized for Chunk<'_, T> {
             self.epilogue.apply(simd, self.first + row, self.panel, sums, self.output);
         }
     }
-}
-
-/// Everything after the product.
-struct Epilogue<'a> {
-    /// Bias and offset of every column of all panels.
-    summands: Vec<f32>,
-    activation: Activation,
-    arrangement: Arrangement,
-    residual: Option<&'a [f32]>,
-    channels: usize,
-}
-
-impl<'a> Epilogue<'a> {
-    fn new(
-        weight: &PackedWeight,
-        fused: &Convolution<'a, Tensor>,
-        shape: Shape,
-    ) -> Result<Epilogue<'a>> {
-        let mut summands = weight.bias.clone();
-        if let Some(offset) = fused.offset {
-            let one = Shape { batch: 1, height: 1, width: 1, ..shape };
-            let fits = offset.shape == one && weight.arrangement == Arrangement::Plain;
-            let values = offset.as_f32().filter(|_| fits);
-            let values = values.ok_or_else(|| unfit("an offset", shape))?;
-            summands.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
-        }
-        let residual = match fused.residual {
-            Some(residual) => Some(check_residual(residual, shape)?),
-            None => None,
-        };
-        Ok(Epilogue {
-            summands,
-            activation: fused.activation,
-            arrangement: weight.arrangement,
-            residual,
-            channels: shape.channels,
-        })
-    }
-
-    /// Finishes one row of a panel.
-    #[inline(always)]
-    fn apply<S: Simd, T: Element>(
-        &self,
-        simd: S,
-        pixel: usize,
-        panel: usize,
-        sums: &[f32],
-        output: &SharedOutput<'_, T>,
-    ) {
-        let summands = &self.summands[panel * PANEL..];
-        let total = |group: usize| {
-            simd.add(load(simd, sums, group * LANES), load(simd, summands, group * LANES))
-        };
-        match self.arrangement {
-            Arrangement::Plain => {
-                for group in 0..PANEL / LANES {
-                    let channel = panel * PANEL + group * LANES;
-                    self.finish(simd, pixel, channel, total(group), output);
-                }
-            }
-            Arrangement::Gated => {
-                let gated = simd.mul(total(0), gelu(simd, total(1)));
-                self.finish(simd, pixel, panel * LANES, gated, output);
-            }
-        }
-    }
-
-    /// Activates a vector of channels, adds the residual and writes it.
-    #[inline(always)]
-    fn finish<S: Simd, T: Element>(
-        &self,
-        simd: S,
-        pixel: usize,
-        channel: usize,
-        value: S::Floats,
-        output: &SharedOutput<'_, T>,
-    ) {
-        let count = LANES.min(self.channels.saturating_sub(channel));
-        let mut value = match self.activation {
-            Activation::None => value,
-            Activation::Silu => sigmoid_linear(simd, value, 1.0),
-            Activation::QuickGelu => sigmoid_linear(simd, value, 1.702),
-        };
-        let start = pixel * self.channels + channel;
-        if let Some(residual) = self.residual {
-            let start = start % residual.len();
-            let end = residual.len().min(start + count);
-            value = simd.add(value, load(simd, &residual[start..end], 0));
-        }
-        // SAFETY: the channels of a panel are written by the one chunk that has this pixel.
-        #[allow(unsafe_code)]
-        let target = unsafe { output.part(start, count) };
-        store(simd, value, target, 0);
-    }
-}
-
-/// The residual's values, if it has the shape of the result or a divisor of its images.
-fn check_residual(residual: &Tensor, shape: Shape) -> Result<&[f32]> {
-    let one = |shape: Shape| (shape.height, shape.width, shape.channels);
-    let images = residual.shape.batch;
-    let fits =
-        one(residual.shape) == one(shape) && images > 0 && shape.batch.is_multiple_of(images);
-    residual.as_f32().filter(|_| fits).ok_or_else(|| unfit("a residual", shape))
-}
-
-fn unfit(what: &str, shape: Shape) -> Error {
-    Error::Internal(format!("{what} does not fit the result {shape:?} of a convolution"))
 }

@@ -14,6 +14,7 @@ mod attention;
 mod backend;
 mod convolution;
 mod cpu;
+mod epilogue;
 mod math;
 mod normalization;
 mod operand;
@@ -23,6 +24,7 @@ mod simd;
 mod tensor;
 mod tile;
 mod vectors;
+mod winograd;
 
 pub use backend::{Activation, Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
 pub use cpu::{CpuBackend, Precision};

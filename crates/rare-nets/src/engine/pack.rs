@@ -16,6 +16,7 @@ use super::arena::Buffer;
 use super::backend::{Arrangement, Kernel};
 use super::cpu::Precision;
 use super::simd::{LANES, Processor, Simd, Vectorized};
+use super::vectors::Stored;
 use crate::{Parameter, Values};
 
 /// Columns of a panel: two groups.
@@ -91,24 +92,29 @@ impl PackedWeight {
         let range = first + steps.start * PANEL..first + steps.end * PANEL;
         match self.storage {
             Storage::F32 | Storage::Pairs => &self.elements.slice::<f32>()[range],
-            Storage::F16 => {
-                let (narrow, _) = self.elements.slice::<f16>()[range].as_chunks::<LANES>();
-                let (wide, _) = scratch.as_chunks_mut::<LANES>();
-                for (narrow, wide) in narrow.iter().zip(wide) {
-                    simd.store(simd.load_f16(narrow), wide);
-                }
-                &scratch[..narrow.len() * LANES]
-            }
-            Storage::Bf16 => {
-                let (narrow, _) = self.elements.slice::<bf16>()[range].as_chunks::<LANES>();
-                let (wide, _) = scratch.as_chunks_mut::<LANES>();
-                for (narrow, wide) in narrow.iter().zip(wide) {
-                    simd.store(simd.load_bf16(narrow), wide);
-                }
-                &scratch[..narrow.len() * LANES]
-            }
+            Storage::F16 => widen(simd, &self.elements.slice::<f16>()[range], scratch),
+            Storage::Bf16 => widen(simd, &self.elements.slice::<bf16>()[range], scratch),
         }
     }
+
+    /// One panel as it is stored (as `T`, which is for the caller to know), vector by vector: tap, step, group.
+    #[inline(always)]
+    pub(super) fn panel<T: Stored>(&self, panel: usize) -> &[[T; LANES]] {
+        let length = self.taps() * self.steps() * (PANEL / LANES);
+        let (vectors, _) = self.elements.slice::<T>().as_chunks::<LANES>();
+        &vectors[panel * length..(panel + 1) * length]
+    }
+}
+
+/// Fills the begin of `scratch`.
+#[inline(always)]
+fn widen<'a, S: Simd, T: Stored>(simd: S, narrow: &[T], scratch: &'a mut [f32]) -> &'a [f32] {
+    let (narrow, _) = narrow.as_chunks::<LANES>();
+    let (wide, _) = scratch.as_chunks_mut::<LANES>();
+    for (narrow, wide) in narrow.iter().zip(wide) {
+        simd.store(T::load(simd, narrow), wide);
+    }
+    &scratch[..narrow.len() * LANES]
 }
 
 /// The sizes of a kernel.

@@ -1,6 +1,6 @@
 //! Slices of any length, sixteen numbers at a time.
 
-use half::bf16;
+use half::{bf16, f16};
 
 use super::simd::{LANES, Simd};
 use super::tensor::Values;
@@ -21,6 +21,32 @@ impl Element for bf16 {
     #[inline(always)]
     fn store<S: Simd>(simd: S, floats: S::Floats, values: &mut [bf16; LANES]) {
         simd.store_bf16(floats, values);
+    }
+}
+
+/// What numbers of weights are stored as.
+pub(super) trait Stored: Copy + bytemuck::Pod {
+    fn load<S: Simd>(simd: S, values: &[Self; LANES]) -> S::Floats;
+}
+
+impl Stored for f32 {
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, values: &[f32; LANES]) -> S::Floats {
+        simd.load(values)
+    }
+}
+
+impl Stored for f16 {
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, values: &[f16; LANES]) -> S::Floats {
+        simd.load_f16(values)
+    }
+}
+
+impl Stored for bf16 {
+    #[inline(always)]
+    fn load<S: Simd>(simd: S, values: &[bf16; LANES]) -> S::Floats {
+        simd.load_bf16(values)
     }
 }
 

@@ -5,6 +5,7 @@ mod attention;
 mod convolution;
 mod repetition;
 mod shapes;
+mod winograd;
 
 use std::fmt::Debug;
 

@@ -5,6 +5,7 @@ use rare_nets::engine::{Activation, Backend, CpuBackend, Precision, Shape};
 
 use super::attention::{CrossAttention, Projected, SelfAttention};
 use super::convolution::{Before, Case, Format};
+use super::winograd::{doubled, large, odd};
 use super::{Concatenation, Operation, on_every_processor};
 
 /// Results of operations that together use every kind of buffer, and of which several threads have their part.
@@ -28,6 +29,9 @@ fn results(backend: &CpuBackend) -> Result<Vec<Vec<u32>>> {
         image.run(backend),
         narrow.run(backend),
         long.run(backend),
+        odd(Format::F16).run(backend),
+        large().run(backend),
+        doubled().run(backend),
         pixels.run(backend),
         Projected(projected).run(backend),
         context.run(backend),
