@@ -1,6 +1,7 @@
 //! What was typed.
 
 mod eval;
+mod icp;
 mod weights;
 
 use std::path::PathBuf;
@@ -13,6 +14,7 @@ use serde::Serialize;
 pub(crate) use self::eval::{
     DatasetKind, EvalArgs, Format, ProtocolChoice, ScoreArgs, ScoringArgs,
 };
+pub(crate) use self::icp::{IcpArgs, TrimChoice};
 #[cfg(feature = "fetch")]
 pub(crate) use self::weights::FetchArgs;
 pub(crate) use self::weights::{CheckArgs, WeightsArgs, WeightsCommand};
@@ -73,6 +75,8 @@ pub(crate) enum Command {
     Register(RegisterArgs),
     /// Refine a given transform between two clouds
     Refine(RefineArgs),
+    /// Align two clouds by a method of the ICP family, without the features and the verdict of `refine`
+    Icp(IcpArgs),
     /// Write the dense features of the depth maps of a pair, or of one cloud at its points
     Features(FeaturesArgs),
     /// Say what is in cloud files, and which lengths would be used for them
@@ -108,7 +112,7 @@ pub(crate) struct RegisterArgs {
     #[command(flatten)]
     pub(crate) clouds: Clouds,
     /// How the initial transform is estimated [default: sc2-pcr]
-    #[arg(long, value_name = "METHOD", value_parser = choice::<InitialMethod>(&["ransac", "sc2-pcr"]))]
+    #[arg(long, value_name = "METHOD", value_parser = choice::<InitialMethod>(&["ransac", "sc2-pcr", "sc2-pcr++", "mac", "fast-mac"]))]
     pub(crate) init_method: Option<InitialMethod>,
     #[command(flatten)]
     pub(crate) options: Options,

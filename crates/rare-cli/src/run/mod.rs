@@ -5,6 +5,7 @@ mod convert;
 mod demo;
 mod eval;
 mod features;
+mod icp;
 mod info;
 mod refine;
 mod register;
@@ -31,6 +32,7 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
     match cli.command {
         Command::Register(args) => register::run(args),
         Command::Refine(args) => refine::run(args),
+        Command::Icp(args) => icp::run(&args),
         Command::Features(args) => features::run(args),
         Command::Info(args) => info::run(&args),
         Command::Convert(args) => convert::run(&args),
@@ -145,10 +147,15 @@ fn check_outputs(settings: &Settings, inputs: &[&Path]) -> Result<()> {
 }
 
 fn start_threads(settings: &Settings) -> Result<()> {
+    start_pool(settings.threads)
+}
+
+/// As many threads as that, 0 for all cores.
+fn start_pool(threads: usize) -> Result<()> {
     rayon::ThreadPoolBuilder::new()
-        .num_threads(settings.threads)
+        .num_threads(threads)
         .build_global()
-        .with_context(|| format!("--threads {}", settings.threads))
+        .with_context(|| format!("--threads {threads}"))
 }
 
 fn read_scan(file: &Path) -> Result<Scan> {

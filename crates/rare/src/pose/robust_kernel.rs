@@ -15,6 +15,7 @@ pub enum RobustKernel {
     /// `1 / (1 + (r/k)^2)`.
     Cauchy,
     /// `1 / (1 + (r/k)^2)^2`.
+    #[serde(rename = "geman-mcclure")]
     GemanMcClure,
 }
 

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::data::{Correspondence, PointFeatures, RigidTransform};
 use crate::error::Result;
 use crate::matching::{correspondences, nearest};
-use crate::pose::{PoseEstimator, Ransac, Sc2Pcr};
+use crate::pose::{FastMac, Mac, PoseEstimate, PoseEstimator, Ransac, Sc2Pcr, Sc2PcrPlusPlus};
 use crate::random::Random;
 use crate::refine::hypotheses::{Candidate, rank};
 use crate::refine::working_pair::WorkingPair;
@@ -20,6 +20,13 @@ pub enum InitialMethod {
     Sc2Pcr,
     /// RANSAC with three-point samples.
     Ransac,
+    /// SC2-PCR++: the poses of SC2-PCR, chosen among by features and space together.
+    #[serde(rename = "sc2-pcr++")]
+    Sc2PcrPlusPlus,
+    /// MAC (maximal cliques): several hypotheses, the most depth-consistent one wins.
+    Mac,
+    /// MAC on a sample that keeps half of the matches.
+    FastMac,
 }
 
 /// Voxel points that get a feature.
@@ -38,20 +45,46 @@ pub(super) fn estimate(
 ) -> Result<RigidTransform> {
     let source = pair.source.histograms(&pair.scale, KEYPOINTS, &mut Random::new(seed, 2))?;
     let target = pair.target.histograms(&pair.scale, KEYPOINTS, &mut Random::new(seed, 3))?;
-    let pairs = putative(&source, &target)?;
-    match method {
-        InitialMethod::Ransac => {
-            let estimator = Ransac { seed, ..Ransac::for_voxel(pair.scale.voxel) };
-            Ok(estimator.estimate(pair.source_cloud, pair.target_cloud, &pairs)?.target_from_source)
-        }
+    let voxel = pair.scale.voxel;
+    let estimates = match method {
         InitialMethod::Sc2Pcr => {
-            let estimates = Sc2Pcr::for_voxel(pair.scale.voxel).hypotheses(&pairs, HYPOTHESES)?;
-            let poses: Vec<RigidTransform> =
-                estimates.iter().map(|estimate| estimate.target_from_source).collect();
-            let first = Candidate::judged(poses[0], verifier);
-            Ok(rank(&poses[1..], &first, verifier, pair.scale.voxel)[0].target_from_source)
+            Sc2Pcr::for_voxel(voxel).hypotheses(&putative(&source, &target)?, HYPOTHESES)?
         }
+        InitialMethod::Mac => {
+            Mac::for_voxel(voxel).hypotheses(&putative(&source, &target)?, HYPOTHESES)?
+        }
+        InitialMethod::FastMac => {
+            let estimator = FastMac { seed, ..FastMac::for_voxel(voxel) };
+            estimator.hypotheses(&putative(&source, &target)?, HYPOTHESES)?
+        }
+        InitialMethod::Ransac => {
+            let estimator = Ransac { seed, ..Ransac::for_voxel(voxel) };
+            let pairs = putative(&source, &target)?;
+            vec![estimator.estimate(pair.source_cloud, pair.target_cloud, &pairs)?]
+        }
+        InitialMethod::Sc2PcrPlusPlus => {
+            let estimator = Sc2PcrPlusPlus { seed, ..Sc2PcrPlusPlus::for_voxel(voxel) };
+            let (pairs, candidates) = estimator.correspond(&source, &target)?;
+            vec![estimator.estimate_with(&pairs, &candidates)?]
+        }
+    };
+    Ok(most_consistent(&estimates, verifier, voxel))
+}
+
+/// The pose that depth consistency prefers; estimators give at least one.
+fn most_consistent(
+    estimates: &[PoseEstimate],
+    verifier: &Verifier<'_>,
+    voxel: f64,
+) -> RigidTransform {
+    let poses: Vec<RigidTransform> =
+        estimates.iter().map(|estimate| estimate.target_from_source).collect();
+    let Some((first, others)) = poses.split_first() else { return RigidTransform::identity() };
+    if others.is_empty() {
+        return *first;
     }
+    let ranked = rank(others, &Candidate::judged(*first, verifier), verifier, voxel);
+    ranked.first().map_or(*first, |best| best.target_from_source)
 }
 
 /// For every source keypoint its nearest target keypoint in feature space; the best-scored ones. Matches are not

@@ -2,8 +2,10 @@
 
 use anyhow::{Result, bail};
 use rare::nalgebra::Matrix4;
+use rare::pose::{IcpMethod, MultiScaleIcp};
+use rare::scale::{Profile, Scale};
 use rare::verify::Verdict;
-use rare::{Recipe, Refiner, RefinerConfig, RigidTransform, Scan};
+use rare::{InitialMethod, PointCloud, Recipe, Refiner, RefinerConfig, RigidTransform, Scan};
 
 use crate::options::Settings;
 
@@ -17,6 +19,10 @@ enum Kind {
     /// The initial transform as it is.
     Init,
     Refine(RefinerConfig),
+    /// A method of the ICP family, from the initial transform; the voxel size if it is not the clouds' own.
+    Icp(IcpMethod, Option<f64>),
+    /// An estimator on matches of 3D features; the initial transform does not count.
+    Estimate(InitialMethod, RefinerConfig),
 }
 
 /// What a method made of a pair.
@@ -27,7 +33,7 @@ pub(super) struct Found {
 }
 
 /// All names, for help and errors.
-const NAMES: &str = "init, refine, refine-paper, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-fallback";
+const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac, sc2-pcr, sc2-pcr++, mac, fast-mac, refine, refine-paper, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-fallback";
 
 impl Method {
     /// Reads a list of names.
@@ -59,6 +65,14 @@ impl Method {
             Kind::Init => {
                 Ok(Found { target_from_source: *initial, confidence: None, verdict: None })
             }
+            Kind::Icp(method, voxel) => {
+                let initial = RigidTransform::from_matrix(initial)?;
+                align(*method, *voxel, source, reference, &initial)
+            }
+            Kind::Estimate(method, config) => {
+                let refiner = Refiner::new(config.clone());
+                Ok(Found::without_verdict(&refiner.estimate_initial(source, reference, *method)?))
+            }
             Kind::Refine(config) => {
                 let initial = RigidTransform::from_matrix(initial)?;
                 let refinement =
@@ -73,13 +87,47 @@ impl Method {
     }
 }
 
+impl Found {
+    /// A method that only gives a transform.
+    fn without_verdict(pose: &RigidTransform) -> Found {
+        Found { target_from_source: pose.to_matrix(), confidence: None, verdict: None }
+    }
+}
+
+fn align(
+    method: IcpMethod,
+    voxel: Option<f64>,
+    source: &Scan,
+    reference: &Scan,
+    initial: &RigidTransform,
+) -> rare::Result<Found> {
+    let (source, reference) = (&source.cloud, &reference.cloud);
+    let scale = Scale::new(Profile::Auto, voxel, source, reference)?;
+    let local = PointCloud::to_local(reference, source, initial);
+    let icp = MultiScaleIcp::for_voxel(method, scale.voxel);
+    let pose = icp.align(source.points(), reference.points(), &local)?.target_from_source;
+    Ok(Found::without_verdict(&PointCloud::to_world(reference, source, &pose)))
+}
+
 impl Kind {
     fn parse(name: &str, settings: &Settings) -> Result<Kind> {
         let given = &settings.refiner;
         let with = |recipe: Recipe| Kind::Refine(RefinerConfig { recipe, ..given.clone() });
         let recipe = given.recipe.clone();
+        let icp = |method| Kind::Icp(method, given.voxel);
+        let estimate = |method| Kind::Estimate(method, given.clone());
         Ok(match name {
             "init" => Kind::Init,
+            "point-to-point" => icp(IcpMethod::PointToPoint),
+            "point-to-plane" => icp(IcpMethod::PointToPlane),
+            "symmetric" => icp(IcpMethod::Symmetric),
+            "gicp" => icp(IcpMethod::Generalised),
+            "vgicp" => icp(IcpMethod::VoxelisedGeneralised),
+            "ransac" => estimate(InitialMethod::Ransac),
+            "sc2-pcr" => estimate(InitialMethod::Sc2Pcr),
+            "sc2-pcr++" => estimate(InitialMethod::Sc2PcrPlusPlus),
+            "mac" => estimate(InitialMethod::Mac),
+            "fast-mac" => estimate(InitialMethod::FastMac),
             "refine" => with(recipe),
             "refine-paper" => with(Recipe::paper()),
             "refine-one-round" => with(Recipe { rounds: 1, ..recipe }),
