@@ -191,6 +191,16 @@ impl Refiner {
         Ok(pair.to_world(&initial::estimate(&pair, method, self.config.seed, &verifier)?))
     }
 
+    /// The matches of fast point feature histograms from which [`Refiner::register`] begins: the best-scored ones, each
+    /// side in its cloud's frame as the caller gave it, metres.
+    ///
+    /// # Errors
+    /// As [`Refiner::refine`].
+    pub fn initial_matches(&self, source: &Scan, target: &Scan) -> Result<Vec<Correspondence>> {
+        let pair = WorkingPair::new(source, target, &self.config)?;
+        Ok(pair.to_world_pairs(&initial::matches(&pair, self.config.seed)?))
+    }
+
     /// Rounds of the paper's method, each from the pose of the one before.
     fn run(
         &self,
@@ -238,7 +248,9 @@ impl Refiner {
             views::transfer_all(pair, &viewpoints, pose, &maps, &features, self.sampling())
         });
         let fused = clock.time("fuse", || views::fuse_all(pair, &lifted));
-        clock.time("match", || views::match_all(pair, &viewpoints, &lifted, &fused, given))
+        let sets =
+            clock.time("match", || views::match_all(pair, &viewpoints, &lifted, &fused, given))?;
+        Ok(if recipe.feature_transfer { sets } else { sets.without_common_points() })
     }
 
     /// Steps 8 and 9: the hypotheses of the sets, and the one that depth consistency prefers.

@@ -161,6 +161,8 @@ pub(crate) enum DatasetKind {
     /// 3DLoMatch: the same with the pairs of 10 to 30 % overlap
     #[value(name = "3dlomatch")]
     ThreeDLoMatch,
+    /// The tables of the paper, as far as the data goes: these benchmarks, and features/NETWORK/BENCHMARK with what official runs of the networks left
+    Paper,
     /// KITTI odometry: sequences 8, 9 and 10, scans as velodyne/*.bin
     Kitti,
 }

@@ -4,6 +4,7 @@
 //! that pass 2 prints depends on who found a result, when, or in which order.
 
 mod method;
+mod paper;
 mod start;
 mod work;
 
@@ -30,6 +31,10 @@ struct Plan {
 }
 
 pub(super) fn run(args: EvalArgs) -> Result<u8> {
+    if args.dataset == DatasetKind::Paper {
+        let settings = args.options.clone().resolve()?;
+        return paper::run(&args, &settings);
+    }
     let scoring = args.scoring.clone();
     let is_shard = args.shard.is_some();
     let plan = Plan::new(args)?;
@@ -78,6 +83,7 @@ impl Plan {
 fn read_dataset(args: &EvalArgs) -> Result<Dataset> {
     let mut dataset = match args.dataset {
         DatasetKind::Folder => dataset::read_folder(&args.root, &args.pairs, &args.truth)?,
+        DatasetKind::Paper => bail!("the paper's tables are no single benchmark"),
         DatasetKind::ThreeDMatch => dataset::read_three_d_match(&args.root, "3DMatch")?,
         DatasetKind::ThreeDLoMatch => dataset::read_three_d_match(&args.root, "3DLoMatch")?,
         DatasetKind::Kitti => dataset::read_kitti(&args.root, args.kitti_gt.into())?,

@@ -105,7 +105,7 @@ pub(super) fn write_tables(
     }
 }
 
-fn write_text(path: &Path, text: &str) -> Result<()> {
+pub(super) fn write_text(path: &Path, text: &str) -> Result<()> {
     Ok(write_whole(path, |writer| writer.write_all(text.as_bytes()))?)
 }
 

@@ -69,6 +69,14 @@ impl CorrespondenceSets {
     pub fn union(&self) -> Vec<Correspondence> {
         self.sets.iter().flat_map(|set| &set.pairs).copied().collect()
     }
+
+    /// The sets of either kind of feature alone.
+    #[must_use]
+    pub fn without_common_points(mut self) -> CorrespondenceSets {
+        let is_common = |name| matches!(name, SetName::CommonReference | SetName::CommonSource);
+        self.sets.retain(|set| !is_common(set.name));
+        self
+    }
 }
 
 #[cfg(test)]

@@ -78,6 +78,12 @@ impl Protocol {
         }
     }
 
+    /// Whether it is one for scans of streets.
+    #[must_use]
+    pub fn is_outdoors(self) -> bool {
+        matches!(self, Protocol::Kitti2m | Protocol::Kitti60cm)
+    }
+
     /// The rules with which its published numbers were made, traps included.
     #[must_use]
     pub fn published(self) -> Rules {

@@ -101,6 +101,44 @@ fn recording_entries(recording: &Recording) -> [Entry; 4] {
     ]
 }
 
+/// What an official run left of a pair: correspondences and the transform that it estimated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RegistrationDump {
+    /// Each side in its cloud's frame, metres, with scores.
+    pub correspondences: Vec<Correspondence>,
+    /// Moves the source into the frame of the reference, as the file holds it.
+    pub target_from_source: Matrix4<f64>,
+}
+
+/// Reads the dump of a pair by GeoTransformer's `test.py`: an NPZ archive with `ref_corr_points`, `src_corr_points`,
+/// `corr_scores` and `estimated_transform` (source to reference).
+///
+/// # Errors
+/// As [`read_correspondences`].
+pub fn read_registration_dump(path: impl AsRef<Path>) -> Result<RegistrationDump> {
+    let path = path.as_ref();
+    let mut file = NpzFile::open(path)?;
+    let source = points(path, &mut file, "src_corr_points")?;
+    let target = points(path, &mut file, "ref_corr_points")?;
+    if source.len() != target.len() {
+        let (sources, targets) = (source.len(), target.len());
+        return Err(count_error(path, "src_corr_points", sources, "ref_corr_points", targets));
+    }
+    let scores = scores(path, &file.array_f64("corr_scores")?, source.len())?;
+    let transform = file.array_f64("estimated_transform")?;
+    if transform.shape != [4, 4] {
+        return Err(shape_error(path, "estimated_transform", "4 x 4", &transform.shape));
+    }
+    check_finite(path, "estimated_transform", &transform.values, 4)?;
+    let pairs = source.into_iter().zip(target).zip(scores);
+    Ok(RegistrationDump {
+        correspondences: pairs
+            .map(|((source, target), score)| Correspondence { source, target, score })
+            .collect(),
+        target_from_source: Matrix4::from_row_slice(&transform.values),
+    })
+}
+
 /// Reads correspondences: an NPZ archive of `source` and `reference` (`N x 3`, metres, each in its cloud's frame) and,
 /// if there is one, `score` (`N`, at least 0; 1 where it is missing).
 ///

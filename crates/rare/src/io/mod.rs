@@ -39,8 +39,8 @@ use std::path::{Path, PathBuf};
 use nalgebra::Point3;
 
 pub use self::features::{
-    read_correspondences, read_depth_features, read_point_features, write_depth_features,
-    write_point_features,
+    RegistrationDump, read_correspondences, read_depth_features, read_point_features,
+    read_registration_dump, write_depth_features, write_point_features,
 };
 pub use self::npy::Array;
 pub use self::npz::NpzFile;

@@ -36,6 +36,10 @@ pub struct Recipe {
     /// Whether features are interpolated at the keypoints with aligned corners (the paper's source FreeReg) instead
     /// of being taken from the keypoint's own cell.
     pub aligned_corners: bool,
+    /// Whether the sets of common points (fused features) are used beside those of either kind of feature alone.
+    pub feature_transfer: bool,
+    /// Whether the sets vote for the best of their transforms, instead of one weighted fit over all correspondences.
+    pub inlier_aggregation: bool,
     /// Whether each set gives hypotheses by consensus (SC2-PCR) instead of one weighted fit over all its pairs.
     pub consensus: bool,
     /// Whether the initial transform competes with the refined one, and the winner is chosen by depth consistency.
@@ -69,6 +73,8 @@ impl Default for Recipe {
             rounds: 2,
             components: None,
             aligned_corners: false,
+            feature_transfer: true,
+            inlier_aggregation: true,
             consensus: true,
             keep_initial: true,
             polish: true,
@@ -88,6 +94,8 @@ impl Recipe {
             rounds: 1,
             components: Some(128),
             aligned_corners: true,
+            feature_transfer: true,
+            inlier_aggregation: true,
             consensus: false,
             keep_initial: false,
             polish: false,

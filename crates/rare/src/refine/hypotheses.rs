@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use crate::aggregate::{Aggregation, aggregate, aggregate_candidates};
 use crate::data::{Correspondence, CorrespondenceSets, RigidTransform};
 use crate::error::Result;
-use crate::pose::{Icp, IcpStage, RobustKernel, Sc2Pcr};
+use crate::pose::{Icp, IcpStage, RobustKernel, Sc2Pcr, fit_weighted};
 use crate::refine::Recipe;
 use crate::refine::working_pair::WorkingPair;
 use crate::scale::Scale;
@@ -49,6 +49,11 @@ pub(super) fn propose(
         reweighting_rounds: recipe.reweighting_rounds,
         top: recipe.top,
     };
+    if !recipe.inlier_aggregation {
+        let all = sets.union();
+        let weighted = all.iter().map(|pair| (pair.source, pair.target, pair.score));
+        return Ok(vec![fit_weighted(weighted)?]);
+    }
     if !recipe.consensus {
         return Ok(vec![aggregate(sets, &config, None)?.consensus.target_from_source]);
     }

@@ -43,8 +43,7 @@ pub(super) fn estimate(
     seed: u64,
     verifier: &Verifier<'_>,
 ) -> Result<RigidTransform> {
-    let source = pair.source.histograms(&pair.scale, KEYPOINTS, &mut Random::new(seed, 2))?;
-    let target = pair.target.histograms(&pair.scale, KEYPOINTS, &mut Random::new(seed, 3))?;
+    let [source, target] = histograms(pair, seed)?;
     let voxel = pair.scale.voxel;
     let estimates = match method {
         InitialMethod::Sc2Pcr => {
@@ -85,6 +84,18 @@ fn most_consistent(
     }
     let ranked = rank(others, &Candidate::judged(*first, verifier), verifier, voxel);
     ranked.first().map_or(*first, |best| best.target_from_source)
+}
+
+/// The matches that the estimators get, working frames.
+pub(super) fn matches(pair: &WorkingPair<'_>, seed: u64) -> Result<Vec<Correspondence>> {
+    let [source, target] = histograms(pair, seed)?;
+    putative(&source, &target)
+}
+
+fn histograms(pair: &WorkingPair<'_>, seed: u64) -> Result<[PointFeatures; 2]> {
+    let source = pair.source.histograms(&pair.scale, KEYPOINTS, &mut Random::new(seed, 2))?;
+    let target = pair.target.histograms(&pair.scale, KEYPOINTS, &mut Random::new(seed, 3))?;
+    Ok([source, target])
 }
 
 /// For every source keypoint its nearest target keypoint in feature space; the best-scored ones. Matches are not

@@ -109,15 +109,20 @@ impl<'a> WorkingPair<'a> {
     }
 
     /// Correspondences of the working frames in the callers' frames.
-    pub(crate) fn to_world_sets(&self, sets: &CorrespondenceSets) -> CorrespondenceSets {
+    pub(crate) fn to_world_pairs(&self, pairs: &[Correspondence]) -> Vec<Correspondence> {
         let to_world = |pair: &Correspondence| Correspondence {
             source: pair.source * self.unit + self.source_cloud.shift(),
             target: pair.target * self.unit + self.target_cloud.shift(),
             score: pair.score,
         };
+        pairs.iter().map(to_world).collect()
+    }
+
+    /// The same for all sets.
+    pub(crate) fn to_world_sets(&self, sets: &CorrespondenceSets) -> CorrespondenceSets {
         let set_to_world = |set: &CorrespondenceSet| CorrespondenceSet {
             name: set.name,
-            pairs: set.pairs.iter().map(to_world).collect(),
+            pairs: self.to_world_pairs(&set.pairs),
         };
         CorrespondenceSets { sets: sets.sets.iter().map(set_to_world).collect() }
     }

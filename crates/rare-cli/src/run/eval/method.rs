@@ -2,11 +2,14 @@
 
 use anyhow::{Result, bail};
 use rare::nalgebra::Matrix4;
-use rare::pose::{IcpMethod, MultiScaleIcp};
+use rare::pose::{FastMac, IcpMethod, Mac, MultiScaleIcp, PoseEstimator, Ransac, Sc2Pcr};
 use rare::scale::{Profile, Scale};
 use rare::verify::Verdict;
-use rare::{InitialMethod, PointCloud, Recipe, Refiner, RefinerConfig, RigidTransform, Scan};
+use rare::{
+    Correspondence, InitialMethod, PointCloud, Recipe, Refiner, RefinerConfig, RigidTransform, Scan,
+};
 
+use super::start::Start;
 use crate::options::Settings;
 
 /// A method by its name.
@@ -21,8 +24,20 @@ enum Kind {
     Refine(RefinerConfig),
     /// A method of the ICP family, from the initial transform; the voxel size if it is not the clouds' own.
     Icp(IcpMethod, Option<f64>),
-    /// An estimator on matches of 3D features; the initial transform does not count.
-    Estimate(InitialMethod, RefinerConfig),
+    /// An estimator on the correspondences that came with the start, or else on matches of 3D features; the initial
+    /// transform does not count.
+    Estimate(Estimator, RefinerConfig),
+}
+
+/// An estimator of the paper's tables.
+#[derive(Clone, Copy)]
+enum Estimator {
+    /// With so many samples.
+    Ransac(usize),
+    Sc2Pcr,
+    Sc2PcrPlusPlus,
+    Mac,
+    FastMac,
 }
 
 /// What a method made of a pair.
@@ -33,7 +48,7 @@ pub(super) struct Found {
 }
 
 /// All names, for help and errors.
-const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac, sc2-pcr, sc2-pcr++, mac, fast-mac, refine, refine-paper, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-fallback";
+const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac-50k, ransac-1m, sc2-pcr, sc2-pcr++, mac, fast-mac, refine, refine-paper, refine-no-pca, refine-no-transfer, refine-no-aggregation, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-fallback";
 
 impl Method {
     /// Reads a list of names.
@@ -59,8 +74,9 @@ impl Method {
         &self,
         source: &Scan,
         reference: &Scan,
-        initial: &Matrix4<f64>,
+        start: &Start,
     ) -> rare::Result<Found> {
+        let initial = &start.pose;
         match &self.kind {
             Kind::Init => {
                 Ok(Found { target_from_source: *initial, confidence: None, verdict: None })
@@ -69,14 +85,17 @@ impl Method {
                 let initial = RigidTransform::from_matrix(initial)?;
                 align(*method, *voxel, source, reference, &initial)
             }
-            Kind::Estimate(method, config) => {
-                let refiner = Refiner::new(config.clone());
-                Ok(Found::without_verdict(&refiner.estimate_initial(source, reference, *method)?))
-            }
+            Kind::Estimate(estimator, config) => match &start.correspondences {
+                Some(pairs) => estimator.on_pairs(pairs, source, reference, config),
+                None => estimator.on_features(source, reference, config),
+            },
             Kind::Refine(config) => {
                 let initial = RigidTransform::from_matrix(initial)?;
-                let refinement =
-                    Refiner::new(config.clone()).refine(source, reference, &initial)?;
+                let refiner = Refiner::new(config.clone());
+                let refinement = match &start.correspondences {
+                    Some(pairs) => refiner.refine_matched(source, reference, &initial, pairs)?,
+                    None => refiner.refine(source, reference, &initial)?,
+                };
                 Ok(Found {
                     target_from_source: refinement.target_from_source.to_matrix(),
                     confidence: Some(refinement.confidence),
@@ -84,6 +103,52 @@ impl Method {
                 })
             }
         }
+    }
+}
+
+impl Estimator {
+    /// Applies it to given correspondences, with the presets that fit the size of the clouds.
+    fn on_pairs(
+        self,
+        pairs: &[Correspondence],
+        source: &Scan,
+        reference: &Scan,
+        config: &RefinerConfig,
+    ) -> rare::Result<Found> {
+        let (source, reference) = (&source.cloud, &reference.cloud);
+        let voxel = Scale::new(config.profile, config.voxel, source, reference)?.voxel;
+        let estimate = |estimator: &dyn PoseEstimator| estimator.estimate(source, reference, pairs);
+        let estimate = match self {
+            Estimator::Ransac(max_iterations) => {
+                estimate(&Ransac { max_iterations, seed: config.seed, ..Ransac::for_voxel(voxel) })
+            }
+            Estimator::Sc2Pcr => estimate(&Sc2Pcr::for_voxel(voxel)),
+            Estimator::Mac => estimate(&Mac::for_voxel(voxel)),
+            Estimator::FastMac => {
+                estimate(&FastMac { seed: config.seed, ..FastMac::for_voxel(voxel) })
+            }
+            Estimator::Sc2PcrPlusPlus => Err(rare::Error::Unsupported(
+                "sc2-pcr++ needs the descriptors of all keypoints, which came not with the start"
+                    .to_owned(),
+            )),
+        }?;
+        Ok(Found::without_verdict(&estimate.target_from_source))
+    }
+
+    /// Applies it to matches of built-in features.
+    fn on_features(
+        self,
+        source: &Scan,
+        reference: &Scan,
+        config: &RefinerConfig,
+    ) -> rare::Result<Found> {
+        let refiner = Refiner::new(config.clone());
+        if let Estimator::Sc2PcrPlusPlus = self {
+            let method = InitialMethod::Sc2PcrPlusPlus;
+            let pose = refiner.estimate_initial(source, reference, method)?;
+            return Ok(Found::without_verdict(&pose));
+        }
+        self.on_pairs(&refiner.initial_matches(source, reference)?, source, reference, config)
     }
 }
 
@@ -123,13 +188,17 @@ impl Kind {
             "symmetric" => icp(IcpMethod::Symmetric),
             "gicp" => icp(IcpMethod::Generalised),
             "vgicp" => icp(IcpMethod::VoxelisedGeneralised),
-            "ransac" => estimate(InitialMethod::Ransac),
-            "sc2-pcr" => estimate(InitialMethod::Sc2Pcr),
-            "sc2-pcr++" => estimate(InitialMethod::Sc2PcrPlusPlus),
-            "mac" => estimate(InitialMethod::Mac),
-            "fast-mac" => estimate(InitialMethod::FastMac),
+            "ransac-50k" => estimate(Estimator::Ransac(50_000)),
+            "ransac-1m" => estimate(Estimator::Ransac(1_000_000)),
+            "sc2-pcr" => estimate(Estimator::Sc2Pcr),
+            "sc2-pcr++" => estimate(Estimator::Sc2PcrPlusPlus),
+            "mac" => estimate(Estimator::Mac),
+            "fast-mac" => estimate(Estimator::FastMac),
             "refine" => with(recipe),
             "refine-paper" => with(Recipe::paper()),
+            "refine-no-pca" => with(Recipe { components: None, ..recipe }),
+            "refine-no-transfer" => with(Recipe { feature_transfer: false, ..recipe }),
+            "refine-no-aggregation" => with(Recipe { inlier_aggregation: false, ..recipe }),
             "refine-one-round" => with(Recipe { rounds: 1, ..recipe }),
             "refine-no-polish" => with(Recipe { polish: false, ..recipe }),
             "refine-no-consensus" => with(Recipe { consensus: false, ..recipe }),

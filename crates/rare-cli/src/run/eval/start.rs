@@ -1,13 +1,13 @@
 //! Where the methods start from.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
-use rare::InitialMethod;
 use rare::eval::dataset::{self, Dataset, StartPose};
 use rare::eval::trajectory;
 use rare::nalgebra::Matrix4;
+use rare::{Correspondence, InitialMethod};
 use serde::Deserialize;
 use serde::de::IntoDeserializer;
 use serde::de::value::{Error as ValueError, StrDeserializer};
@@ -19,11 +19,21 @@ pub(super) enum Starts {
     Given(Vec<Matrix4<f64>>),
     /// Made for each pair.
     Estimated(InitialMethod),
+    /// What GeoTransformer's own run left of each pair, transform and correspondences.
+    Dumped(Vec<PathBuf>),
+}
+
+/// Where the methods start on one pair.
+pub(super) struct Start {
+    /// Moves the source into the frame of the reference.
+    pub(super) pose: Matrix4<f64>,
+    /// Correspondences that came with it, best first.
+    pub(super) correspondences: Option<Vec<Correspondence>>,
 }
 
 impl Starts {
     /// Reads the transforms that `init` names: a method, a JSON file (in the dataset's folder or anywhere), or a folder
-    /// of scenes with `est.log`.
+    /// of scenes with `est.log`, or one of dumps.
     ///
     /// # Errors
     /// If there is no such thing, it is malformed, or a pair has no initial transform.
@@ -37,12 +47,20 @@ impl Starts {
         if !path.exists() {
             bail!("--init {init}: neither a file, nor a file in {}, nor a method", root.display());
         }
+        if let Some(dumps) = dumps(&path, dataset) {
+            return Ok(Starts::Dumped(dumps));
+        }
         let poses = if path.is_dir() {
             read_logs(&path, dataset)?
         } else {
             dataset::read_folder_starts(&path)?
         };
         in_order(&poses, dataset, &path).map(Starts::Given)
+    }
+
+    /// Whether transforms are all that there is.
+    pub(super) fn lack_correspondences(&self) -> bool {
+        !matches!(self, Starts::Dumped(_))
     }
 
     /// What results depend on.
@@ -54,8 +72,35 @@ impl Starts {
                 json!({ "given": poses })
             }
             Starts::Estimated(method) => json!({ "estimated": method }),
+            Starts::Dumped(files) => {
+                let files = files.iter().map(|file| file.display().to_string());
+                json!({ "dumped": files.collect::<Vec<_>>() })
+            }
         }
     }
+}
+
+impl Start {
+    /// Reads a dump and keeps so many of its correspondences, those with the highest scores.
+    pub(super) fn read(file: &Path, most: usize) -> rare::Result<Start> {
+        let mut dump = rare::io::read_registration_dump(file)?;
+        dump.correspondences.sort_by(|a, b| b.score.total_cmp(&a.score));
+        dump.correspondences.truncate(most);
+        Ok(Start { pose: dump.target_from_source, correspondences: Some(dump.correspondences) })
+    }
+}
+
+/// The dumps of all pairs, `SCENE/REF_SRC.npz` or `SEQUENCE_SRC_REF.npz`, if they are there.
+fn dumps(folder: &Path, dataset: &Dataset) -> Option<Vec<PathBuf>> {
+    let file = |pair: &dataset::DatasetPair| {
+        let (scene, source, reference) =
+            (&pair.truth.scene, pair.truth.source, pair.truth.reference);
+        let indoors = folder.join(scene).join(format!("{reference}_{source}.npz"));
+        let sequence = scene.trim_start_matches('0');
+        let outdoors = folder.join(format!("{sequence}_{source}_{reference}.npz"));
+        [indoors, outdoors].into_iter().find(|file| file.is_file())
+    };
+    dataset.pairs.iter().map(file).collect()
 }
 
 /// The logs of all scenes.

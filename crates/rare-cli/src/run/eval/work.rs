@@ -9,12 +9,11 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use rare::eval::dataset::DatasetPair;
 use rare::eval::results::{Estimate, ResultsFolder, rows_of};
-use rare::nalgebra::Matrix4;
 use rare::{Refiner, Scan};
 
 use super::Plan;
 use super::method::{Found, Method};
-use super::start::Starts;
+use super::start::{Start, Starts};
 use crate::progress::Pairs;
 use crate::run::read_scan;
 
@@ -136,27 +135,27 @@ impl Loaded {
         Ok(Loaded { source: read_scan(&pair.source)?, reference: read_scan(&pair.reference)? })
     }
 
-    /// The initial transform, or why there is none.
-    fn start(&self, index: usize, plan: &Plan) -> rare::Result<Matrix4<f64>> {
+    /// Where methods start, or why there is nothing to start from.
+    fn start(&self, index: usize, plan: &Plan) -> rare::Result<Start> {
+        let missing = || rare::Error::Internal(format!("pair {index} has no start"));
         match &plan.starts {
-            Starts::Given(poses) => poses
-                .get(index)
-                .copied()
-                .ok_or_else(|| rare::Error::Internal(format!("pair {index} has no start"))),
+            Starts::Given(poses) => {
+                let pose = poses.get(index).copied().ok_or_else(missing)?;
+                Ok(Start { pose, correspondences: None })
+            }
+            Starts::Dumped(files) => {
+                let most = if plan.dataset.protocol.is_outdoors() { 1000 } else { 500 };
+                Start::read(files.get(index).ok_or_else(missing)?, most)
+            }
             Starts::Estimated(method) => {
                 let refiner = Refiner::new(plan.settings.refiner.clone());
                 let pose = refiner.estimate_initial(&self.source, &self.reference, *method)?;
-                Ok(pose.to_matrix())
+                Ok(Start { pose: pose.to_matrix(), correspondences: None })
             }
         }
     }
 
-    fn estimate(
-        &self,
-        pair: usize,
-        method: &Method,
-        start: &rare::Result<Matrix4<f64>>,
-    ) -> Estimate {
+    fn estimate(&self, pair: usize, method: &Method, start: &rare::Result<Start>) -> Estimate {
         let clock = Instant::now();
         let found = match start {
             Ok(start) => method.apply(&self.source, &self.reference, start),
