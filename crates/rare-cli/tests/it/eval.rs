@@ -177,3 +177,106 @@ fn ten_thousand_pairs_are_scored_at_once() {
     // Five protocols take 0.8 s alone on two cores; the limit leaves room for neighbours.
     assert!(clock.elapsed() < Duration::from_secs(10), "{:?}", clock.elapsed());
 }
+
+/// The benchmark in the layout of 3DMatch, with dumps of a network for every pair.
+fn three_d_match() -> Workplace {
+    let workplace = benchmark();
+    for folder in
+        ["data/benchmarks/3DMatch/room", "data/features/geotransformer/3DMatch/room", "data/room"]
+    {
+        fs::create_dir_all(workplace.path(folder)).unwrap();
+    }
+    let [source, _] = pair().map(|points| shifted(&points, Vector3::new(0.0, 0.0, 3.0)));
+    let (mut log, mut information) = (String::new(), String::new());
+    let pairs: Vec<Value> = serde_json::from_str(&workplace.text("room/pairs.json")).unwrap();
+    fs::copy(workplace.path("room/cloud_bin_0.ply"), workplace.path("data/room/cloud_bin_0.ply"))
+        .unwrap();
+    for pair in pairs.iter().take(2) {
+        let number = pair["src"].as_u64().unwrap();
+        let name = format!("cloud_bin_{number}.ply");
+        fs::copy(workplace.path("room").join(&name), workplace.path("data/room").join(&name))
+            .unwrap();
+        let numbers: Vec<f64> = (pair["gt"].as_array().unwrap().iter())
+            .flat_map(|row| row.as_array().unwrap().iter().map(|value| value.as_f64().unwrap()))
+            .collect();
+        let rows: Vec<String> = numbers
+            .chunks(4)
+            .map(|row| row.iter().map(f64::to_string).collect::<Vec<_>>().join(" "))
+            .collect();
+        // Not consecutive in the list's sense, and never first.
+        log += &format!("0 {number} 9\n{}\n", rows.join("\n"));
+        let diagonal =
+            |r: usize| (0..6).map(|c| if r == c { "9 " } else { "0 " }).collect::<String>() + "\n";
+        information += &(format!("0 {number} 9\n") + &(0..6).map(diagonal).collect::<String>());
+        let truth = RigidTransform::from_matrix(&rare::nalgebra::Matrix4::from_row_slice(&numbers))
+            .unwrap();
+        let cloud =
+            rare::io::read_cloud(workplace.path("room").join(&name)).unwrap().world_points();
+        let some: Vec<_> = cloud.iter().step_by(source.len() / 150).collect();
+        let coordinates = |points: &[rare::nalgebra::Point3<f64>]| {
+            points.iter().flat_map(|point| [point.x, point.y, point.z]).collect::<Vec<f64>>()
+        };
+        let sources: Vec<_> = some.iter().map(|point| **point).collect();
+        // Every third match is wrong.
+        let targets: Vec<_> = (sources.iter().enumerate())
+            .map(|(index, point)| {
+                if index % 3 == 0 {
+                    truth.apply(&sources[(7 * index + 5) % sources.len()])
+                } else {
+                    truth.apply(point)
+                }
+            })
+            .collect();
+        let count = sources.len();
+        workplace.npz(
+            &format!("data/features/geotransformer/3DMatch/room/0_{number}.npz"),
+            &[
+                ("src_corr_points", &[count, 3], coordinates(&sources)),
+                ("ref_corr_points", &[count, 3], coordinates(&targets)),
+                ("corr_scores", &[count], vec![0.5; count]),
+                ("estimated_transform", &[4, 4], numbers),
+            ],
+        );
+    }
+    workplace.write("data/benchmarks/3DMatch/room/gt.log", log);
+    workplace.write("data/benchmarks/3DMatch/room/gt.info", information);
+    workplace
+}
+
+#[test]
+fn the_papers_tables_are_filled_as_far_as_the_data_goes() {
+    let workplace = three_d_match();
+    let outcome =
+        workplace.run(&["eval", "paper", "data", "--out", "out", "--protocol", "dgr", "--quiet"]);
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    let text = workplace.text("out/paper.txt");
+    assert_eq!(text, outcome.stdout);
+    let table = |number: usize| {
+        let from = text.split(&format!("Table {number}:")).nth(1).unwrap();
+        from.split("\nTable ").next().unwrap().to_owned()
+    };
+    let cells = |number: usize, name: &str| -> Vec<String> {
+        let table = table(number);
+        let line = table.lines().find(|line| line.starts_with(&format!("{name} "))).unwrap();
+        line[name.len()..].split_whitespace().map(str::to_owned).collect()
+    };
+    for name in ["RANSAC-50K", "RANSAC-1M", "SC2-PCR", "MAC", "FastMAC", "Ours"] {
+        assert_eq!(cells(1, name)[0], "100.0", "{name} {text}");
+    }
+    assert_eq!(cells(3, "GeoTransformer"), ["100.0", "0.00", "0.000"]);
+    assert_eq!(cells(6, "w/o Inlier Aggregation").len(), 3);
+    for (number, name, why) in [
+        (1, "PointDSC", "trained weights"),
+        (1, "SC2-PCR++", "no transform"),
+        (2, "Ours", "3DLoMatch"),
+        (3, "FCGF", "features/fcgf/3DMatch"),
+        (4, "Ours", "08.txt"),
+        (5, "0, 3, 6", "diffusion weights"),
+    ] {
+        assert_eq!(cells(number, name), ["-", "-", "-"], "{name} {text}");
+        assert!(table(number).contains("not run") && table(number).contains(why), "{why} {text}");
+    }
+    for file in ["out/paper.md", "out/paper.tex", "out/3DMatch-geotransformer/results.jsonl"] {
+        assert!(workplace.path(file).is_file(), "{file}");
+    }
+}
