@@ -83,7 +83,7 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values[values.len() / 2]
 }
 
-/// The medians of ten draws of matches of each pair, degrees and metres: those of the released SC2-PCR (PyTorch on one
+/// The medians of ten draws of matches of each pair, degrees and metres: those of the released SC2-PCR (on the CPU, one
 /// thread) on the same matches.
 const RELEASED: [(f64, f64); 5] =
     [(1.999, 0.0474), (1.199, 0.0235), (0.962, 0.0211), (2.304, 0.0777), (1.272, 0.0404)];
