@@ -8,7 +8,10 @@ use divan::Bencher;
 use nalgebra::{Point3, Rotation3, Vector3};
 use rare::data::{KdTree, resolution, voxel_downsample};
 use rare::features::{estimate_normals, fpfh, orient_towards};
-use rare::pose::{Icp, IcpTarget, Ransac, Sc2Pcr, fit_weighted};
+use rare::pose::{
+    FeatureCandidates, Icp, IcpTarget, LocalToGlobal, PoseEstimator, Ransac, Sc2Pcr,
+    Sc2PcrPlusPlus, fit_weighted,
+};
 use rare::random::Random;
 use rare::{Correspondence, PointCloud, RigidTransform};
 
@@ -153,18 +156,39 @@ fn rigid_fit_of_20(bencher: Bencher) {
     bencher.bench(|| fit_weighted(pairs.iter().map(|pair| (pair.source, pair.target, pair.score))));
 }
 
-#[divan::bench(args = [250, 1000, 2500])]
+#[divan::bench(args = [250, 1000, 2500, 5000])]
 fn sc2_pcr(bencher: Bencher, count: usize) {
     let pairs = correspondences(count);
     bencher.bench(|| Sc2Pcr::three_d_match().hypotheses(&pairs, 5));
 }
 
-#[divan::bench(args = [1000])]
-fn ransac(bencher: Bencher, count: usize) {
-    use rare::pose::PoseEstimator;
+/// A hundred candidates for each keypoint, all but its match at random.
+#[divan::bench(args = [1000, 5000])]
+fn sc2_pcr_plus_plus(bencher: Bencher, count: usize) {
+    let pairs = correspondences(count);
+    let mut candidates = FeatureCandidates::of_pairs(&pairs);
+    for (i, targets) in candidates.targets.iter_mut().enumerate() {
+        targets.extend(pairs.iter().cycle().skip(i + 1).take(99).map(|pair| pair.target));
+    }
+    let estimator = Sc2PcrPlusPlus::three_d_match_fpfh();
+    bencher.bench(|| estimator.estimate_with(&pairs, &candidates));
+}
+
+/// All 50 000 samples, scored by the pairs.
+#[divan::bench(args = [1000, 5000])]
+fn ransac_of_50_000(bencher: Bencher, count: usize) {
     let pairs = correspondences(count);
     let cloud = PointCloud::new(vec![Point3::origin()]);
-    bencher.bench(|| {
-        cloud.as_ref().map(|cloud| Ransac::for_voxel(0.05).estimate(cloud, cloud, &pairs))
-    });
+    let estimator = Ransac { confidence: 1.0, ..Ransac::three_d_match() };
+    bencher.bench(|| cloud.as_ref().map(|cloud| estimator.estimate(cloud, cloud, &pairs)));
+}
+
+#[divan::bench(args = [1000])]
+fn local_to_global(bencher: Bencher, count: usize) {
+    let pairs = correspondences(count);
+    // The right pairs are every tenth.
+    let start = |group: usize| group % 10 + group / 10 * 50;
+    let groups: Vec<Vec<usize>> =
+        (0..count / 5).map(|group| (0..5).map(|at| start(group) + 10 * at).collect()).collect();
+    bencher.bench(|| LocalToGlobal::three_d_match().estimate(&pairs, &groups));
 }

@@ -99,6 +99,6 @@ mod tests {
         let target = features(&[1.0, 3.0, f32::NAN, 1.0, 3.0]);
         let found = ranked(&features(&[0.0, f32::INFINITY, 3.0]), &target, 3);
         assert_eq!(found, [vec![0, 3, 1], vec![], vec![1, 4, 0]]);
-        assert_eq!(ranked(&target, &features(&[]), 3), vec![Vec::new(); 5]);
+        assert_eq!(ranked(&target, &features(&[]), 3), vec![Vec::<u32>::new(); 5]);
     }
 }

@@ -87,7 +87,7 @@ pub(super) fn inliers(
 pub(super) enum Keep {
     /// The last pose, as the official code: it may walk away from a better one.
     Last,
-    /// The best-scored pose on the way.
+    /// The pose on the way with the smallest loss.
     Best,
 }
 
@@ -104,7 +104,8 @@ impl Polish {
     /// Stops as soon as the number of pairs that take part repeats.
     pub(super) fn run(&self, start: RigidTransform, pairs: &[Correspondence]) -> RigidTransform {
         let mut pose = start;
-        let mut best = Hypothesis::new(start, pairs, self.threshold);
+        let mut best = start;
+        let mut least = self.loss(&start, pairs);
         let mut previous = 0;
         for _ in 0..self.rounds {
             let weights: Vec<f64> = pairs.iter().map(|pair| self.weight(&pose, pair)).collect();
@@ -115,12 +116,19 @@ impl Polish {
             previous = count;
             let Ok(next) = fit_weighted(weighted(pairs, &weights)) else { break };
             pose = next;
-            let candidate = Hypothesis::new(pose, pairs, self.threshold);
-            if self.keep == Keep::Last || candidate.score > best.score {
-                best = candidate;
+            let loss = self.loss(&pose, pairs);
+            if self.keep == Keep::Last || loss <= least {
+                (best, least) = (pose, loss);
             }
         }
-        best.target_from_source
+        best
+    }
+
+    /// What the weights minimise: `score * ln(1 + (d / threshold)^2)`, constant from the threshold on. The number of
+    /// pairs that agree would be the wrong judge here: it favours poses that stretch to reach a few more of them.
+    fn loss(&self, pose: &RigidTransform, pairs: &[Correspondence]) -> f64 {
+        let ratio = |pair: &Correspondence| (residual(pose, pair) / self.threshold).min(1.0);
+        pairs.iter().map(|pair| pair.score * ratio(pair).powi(2).ln_1p()).sum()
     }
 
     fn weight(&self, pose: &RigidTransform, pair: &Correspondence) -> f64 {

@@ -72,8 +72,7 @@ impl Consistency {
     /// The soft compatibility `max(0, 1 - D_ij^2 / threshold^2)`.
     #[must_use]
     pub fn soft(&self, i: usize, j: usize, threshold: f64) -> f32 {
-        let ratio = self.difference(i, j) / threshold as f32;
-        (1.0 - ratio * ratio).max(0.0)
+        soft(self.difference(i, j), threshold as f32)
     }
 
     /// `D_ij` for `j = first, first + 1, ...`, as many as `row` has room for.
@@ -121,6 +120,11 @@ impl Consistency {
     }
 }
 
+fn soft(difference: f32, threshold: f32) -> f32 {
+    let ratio = difference / threshold;
+    (1.0 - ratio * ratio).max(0.0)
+}
+
 /// A symmetric graph over correspondences as a matrix of bits.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CompatibilityGraph {
@@ -152,6 +156,11 @@ impl CompatibilityGraph {
     #[must_use]
     pub fn row(&self, i: usize) -> &[u64] {
         self.bits.get(i * self.stride..(i + 1) * self.stride).unwrap_or(&[])
+    }
+
+    /// Whether `i` and `j` are joined.
+    pub(super) fn contains(&self, i: usize, j: usize) -> bool {
+        self.row(i).get(j / WORD).is_some_and(|word| word >> (j % WORD) & 1 == 1)
     }
 
     /// The neighbours of `i`, ascending, `i` among them.
@@ -224,10 +233,16 @@ impl SoftMatrix<'_> {
         graph: &'a CompatibilityGraph,
         threshold: f64,
     ) -> SoftMatrix<'a> {
-        let upper = (0..graph.len())
-            .flat_map(|i| graph.neighbours_after(i).map(move |j| (i, j)))
-            .map(|(i, j)| consistency.soft(i, j, threshold))
-            .collect();
+        let size = graph.len();
+        let joined: usize = (0..size).map(|i| graph.neighbours_after(i).count()).sum();
+        let mut upper = Vec::with_capacity(joined);
+        let mut row = vec![0.0; size];
+        for i in 0..size {
+            // A whole row at once is faster than its few joined pairs one by one.
+            let row = &mut row[i..];
+            consistency.differences(i, i, row);
+            upper.extend(graph.neighbours_after(i).map(|j| soft(row[j - i], threshold as f32)));
+        }
         SoftMatrix { graph, upper }
     }
 

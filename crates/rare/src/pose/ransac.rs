@@ -270,11 +270,13 @@ impl PoseEstimator for Ransac {
                 pairs.len()
             )));
         };
-        significance::require(&best.target_from_source, pairs, self.inlier_threshold)?;
+        // The most agreed with of all poses on the way is seldom the most accurate one.
+        let target_from_source = self.polish().run(best.target_from_source, &weighed);
+        significance::require(&target_from_source, pairs, self.inlier_threshold)?;
         Ok(PoseEstimate {
-            target_from_source: best.target_from_source,
-            inliers: consensus::inliers(&best.target_from_source, pairs, self.inlier_threshold),
-            score: best.score,
+            target_from_source,
+            inliers: consensus::inliers(&target_from_source, pairs, self.inlier_threshold),
+            score: judge.hypothesis(target_from_source).score,
             runner_up: leaders.get(1).map(|other| other.score),
             iterations,
             budget_exhausted,

@@ -326,8 +326,7 @@ impl<'a> Search<'a> {
     /// Of those around a seed (which comes first), the ones that share most neighbours with it among themselves.
     fn second_stage(&self, near: &[usize]) -> Vec<usize> {
         let (_, second) = self.stage_sizes();
-        let threshold = self.settings.compatibility_threshold as f32;
-        let joined = |i: usize, j: usize| self.consistency.difference(i, j) < threshold;
+        let joined = |i: usize, j: usize| self.loose.contains(i, j);
         // All of them are compatible with the seed, so that every common neighbour is a neighbour.
         let degrees = (near.iter().enumerate())
             .map(|(at, &i)| (near.iter().filter(|&&j| joined(i, j)).count() as u32, at))

@@ -28,7 +28,7 @@ const SCALES: usize = 8;
 const EXPECTED_BY_CHANCE: f64 = 1e-3;
 
 /// Points whose distances to all others are looked at, at most.
-const SAMPLED: usize = 256;
+const SAMPLED: usize = 128;
 
 /// Fails with `NoPose` unless [`is_significant`].
 pub(super) fn require(
@@ -64,7 +64,7 @@ fn log_expected(
     threshold: f64,
 ) -> f64 {
     let pairs = distinct(pairs);
-    let residuals = pairs.iter().map(|pair| residual(target_from_source, pair));
+    let residuals = pairs.iter().map(|pair| residual(target_from_source, pair).powi(2));
     let agreeing = below_halves(residuals, threshold);
     let source = chances(&pairs.iter().map(|pair| pair.source).collect::<Vec<_>>(), threshold);
     let target = chances(&pairs.iter().map(|pair| pair.target).collect::<Vec<_>>(), threshold);
@@ -92,13 +92,13 @@ fn distinct(pairs: &[Correspondence]) -> Vec<Correspondence> {
     sorted
 }
 
-/// How many of the distances are below `threshold`, half of it, and so on.
-fn below_halves(distances: impl Iterator<Item = f64>, threshold: f64) -> [usize; SCALES] {
+/// How many of the distances, given squared, are below `threshold`, half of it, and so on.
+fn below_halves(squares: impl Iterator<Item = f64>, threshold: f64) -> [usize; SCALES] {
     let mut counts = [0; SCALES];
-    for distance in distances.filter(|&distance| distance < threshold) {
+    for square in squares.filter(|&square| square < threshold * threshold) {
         let mut scale = threshold;
         for count in &mut counts {
-            *count += usize::from(distance < scale);
+            *count += usize::from(square < scale * scale);
             scale /= 2.0;
         }
     }
@@ -113,7 +113,8 @@ fn chances(points: &[Point3<f64>], threshold: f64) -> [f64; SCALES] {
     let mut near = [0; SCALES];
     for (i, point) in points.iter().enumerate().step_by(step) {
         let others = points.iter().enumerate().filter(|&(j, _)| j != i);
-        let counts = below_halves(others.map(|(_, other)| (other - point).norm()), threshold);
+        let counts =
+            below_halves(others.map(|(_, other)| (other - point).norm_squared()), threshold);
         near.iter_mut().zip(counts).for_each(|(near, count)| *near += count);
         looked_at += points.len() - 1;
     }
