@@ -54,13 +54,7 @@ pub(super) fn convolve(
         upsample: fused.upsample,
         border: weight.side / 2,
     };
-    let layout = preparation.layout(input);
-    if !layout.is_addressable(input.shape.batch) {
-        return Err(Error::Unsupported(format!(
-            "the images {:?} are too large for one convolution: use fewer or smaller ones",
-            input.shape
-        )));
-    }
+    let layout = addressable(&preparation, input)?;
     let operand = preparation.prepare(input);
     let shape = result(input, weight, fused, layout);
     let elements = match (precision, fused.intermediate) {
@@ -83,6 +77,18 @@ pub(super) fn convolve(
         Elements::Bf16 => product.compute::<bf16>(&epilogue, buffer.slice_mut()),
     }
     Ok(Tensor { shape, elements, buffer })
+}
+
+/// The layout of the operand, if its offsets fit.
+fn addressable(preparation: &Preparation<'_>, input: &Tensor) -> Result<Layout> {
+    let layout = preparation.layout(input);
+    if layout.is_addressable(input.shape.batch) {
+        return Ok(layout);
+    }
+    Err(Error::Unsupported(format!(
+        "the images {:?} are too large for one convolution: use fewer or smaller ones",
+        input.shape
+    )))
 }
 
 /// The shape of the result.
