@@ -8,7 +8,7 @@ use divan::Bencher;
 use nalgebra::{Point3, Rotation3, Vector3};
 use rare::data::{KdTree, resolution, voxel_downsample};
 use rare::features::{estimate_normals, fpfh, orient_towards};
-use rare::pose::{Icp, IcpTarget, Ransac, Sc2Pcr, fit_weighted};
+use rare::pose::{FastMac, Icp, IcpTarget, Mac, Ransac, Sc2Pcr, fit_weighted};
 use rare::random::Random;
 use rare::{Correspondence, PointCloud, RigidTransform};
 
@@ -157,6 +157,30 @@ fn rigid_fit_of_20(bencher: Bencher) {
 fn sc2_pcr(bencher: Bencher, count: usize) {
     let pairs = correspondences(count);
     bencher.bench(|| Sc2Pcr::three_d_match().hypotheses(&pairs, 5));
+}
+
+#[divan::bench(args = [250, 1000, 2500])]
+fn mac(bencher: Bencher, count: usize) {
+    let pairs = correspondences(count);
+    bencher.bench(|| Mac::three_d_match().hypotheses(&pairs, 2));
+}
+
+#[divan::bench(args = [250, 1000, 2500])]
+fn fast_mac(bencher: Bencher, count: usize) {
+    let pairs = correspondences(count);
+    bencher.bench(|| FastMac::three_d_match().hypotheses(&pairs, 2));
+}
+
+/// Against the limit on the work: nine tenths of the pairs agree.
+#[divan::bench(args = [500, 1000])]
+fn mac_of_inliers(bencher: Bencher, count: usize) {
+    let mut pairs = correspondences(count);
+    let mut random = Random::new(3, 0);
+    for (i, pair) in pairs.iter_mut().enumerate().filter(|(i, _)| !i.is_multiple_of(10)) {
+        let noise = Vector3::from_fn(|_, _| 0.01 * random.normal());
+        pair.target = motion().apply(&pair.source) + if i % 3 == 0 { noise } else { noise / 3.0 };
+    }
+    bencher.bench(|| Mac::three_d_lo_match().hypotheses(&pairs, 2));
 }
 
 #[divan::bench(args = [1000])]

@@ -11,6 +11,7 @@ mod aggregate;
 mod clouds;
 mod densify;
 mod encoded_views;
+mod fast_mac;
 mod fpfh;
 mod hint;
 mod hostile_files;
