@@ -9,7 +9,7 @@ use nalgebra::{Point3, Rotation3, Vector3};
 use rare::data::{KdTree, resolution, voxel_downsample};
 use rare::features::{estimate_normals, fpfh, orient_towards};
 use rare::pose::{
-    FeatureCandidates, Icp, IcpTarget, LocalToGlobal, PoseEstimator, Ransac, Sc2Pcr,
+    FastMac, FeatureCandidates, Icp, IcpTarget, LocalToGlobal, Mac, PoseEstimator, Ransac, Sc2Pcr,
     Sc2PcrPlusPlus, fit_weighted,
 };
 use rare::random::Random;
@@ -172,6 +172,30 @@ fn sc2_pcr_plus_plus(bencher: Bencher, count: usize) {
     }
     let estimator = Sc2PcrPlusPlus::three_d_match_fpfh();
     bencher.bench(|| estimator.estimate_with(&pairs, &candidates));
+}
+
+#[divan::bench(args = [250, 1000, 2500])]
+fn mac(bencher: Bencher, count: usize) {
+    let pairs = correspondences(count);
+    bencher.bench(|| Mac::three_d_match().hypotheses(&pairs, 2));
+}
+
+#[divan::bench(args = [250, 1000, 2500])]
+fn fast_mac(bencher: Bencher, count: usize) {
+    let pairs = correspondences(count);
+    bencher.bench(|| FastMac::three_d_match().hypotheses(&pairs, 2));
+}
+
+/// Against the limit on the work: nine tenths of the pairs agree.
+#[divan::bench(args = [500, 1000])]
+fn mac_of_inliers(bencher: Bencher, count: usize) {
+    let mut pairs = correspondences(count);
+    let mut random = Random::new(3, 0);
+    for (i, pair) in pairs.iter_mut().enumerate().filter(|(i, _)| !i.is_multiple_of(10)) {
+        let noise = Vector3::from_fn(|_, _| 0.01 * random.normal());
+        pair.target = motion().apply(&pair.source) + if i % 3 == 0 { noise } else { noise / 3.0 };
+    }
+    bencher.bench(|| Mac::three_d_lo_match().hypotheses(&pairs, 2));
 }
 
 /// All 50 000 samples, scored by the pairs.

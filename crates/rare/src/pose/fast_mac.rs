@@ -10,7 +10,7 @@ use crate::data::{Correspondence, PointCloud};
 use crate::error::{Error, Result};
 use crate::pose::consensus;
 use crate::pose::mac::ScoreGraph;
-use crate::pose::{Consistency, Mac, Mode, PoseEstimate, PoseEstimator};
+use crate::pose::{Consistency, Mac, Mode, PoseEstimate, PoseEstimator, significance};
 use crate::random::Random;
 
 /// The settings of FastMAC (Zhang et al., "FastMAC: Stochastic Spectral Sampling of Correspondence Graph", CVPR 2024).
@@ -160,7 +160,7 @@ fn draw(weights: &[f64], count: usize, seed: u64, fill: bool) -> Vec<usize> {
 }
 
 impl PoseEstimator for FastMac {
-    /// Uses the pairs alone.
+    /// Uses the pairs alone; `NoPose` also if no more of them agree than random ones would.
     fn estimate(
         &self,
         _source: &PointCloud,
@@ -168,7 +168,11 @@ impl PoseEstimator for FastMac {
         pairs: &[Correspondence],
     ) -> Result<PoseEstimate> {
         let best = self.hypotheses(pairs, 2)?.into_iter().next();
-        best.ok_or_else(|| Error::Internal("fastmac gave neither a pose nor an error".to_owned()))
+        let best = best.ok_or_else(|| {
+            Error::Internal("fastmac gave neither a pose nor an error".to_owned())
+        })?;
+        significance::require(&best.target_from_source, pairs, self.mac.inlier_threshold)?;
+        Ok(best)
     }
 }
 

@@ -21,7 +21,7 @@ use crate::data::{Correspondence, PointCloud};
 use crate::error::{Error, Result};
 use crate::pose::consensus::{self, Difference, Hypothesis};
 use crate::pose::{
-    CompatibilityGraph, Consistency, Mode, PoseEstimate, PoseEstimator, fit_weighted,
+    CompatibilityGraph, Consistency, Mode, PoseEstimate, PoseEstimator, fit_weighted, significance,
 };
 
 pub(super) use agreement::Agreement;
@@ -33,12 +33,8 @@ use selection::{Clique, Selection};
 /// neighbours, stand for all. Even complete, their graph takes an eighth of the default work.
 const CORE: usize = 400;
 
-/// Poses polished beyond those asked for.
+/// Poses looked at beyond those asked for, because the polished one may take the place of some.
 const SPARE: usize = 8;
-
-/// A pose that fewer pairs agree with is no better than chance: among a thousand wrong pairs there are cliques of four,
-/// and three more must confirm it.
-const MIN_INLIERS: usize = 7;
 
 /// How compatible two correspondences are, given the difference `D` of their lengths.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -86,12 +82,12 @@ impl FirstOrderScore {
 ///
 /// What [`Mode::Faithful`] keeps of the released code:
 /// * the final fits take weighted covariances about unweighted centroids,
-/// * the polishing keeps the step after which the agreement fell,
-/// * the first of more than `max_points` pairs are used.
+/// * of more than `max_points` pairs the first are used.
 ///
-/// [`Mode::Fixed`]: weighted centroids, the best pose on the way, the pairs with the best scores. In neither mode does
-/// ground truth choose between poses, as it does in the released evaluation, and the resolution is a setting instead of
-/// being measured for each pair of clouds.
+/// [`Mode::Fixed`]: weighted centroids, and the pairs with the best scores. Both modes keep the step of the polishing
+/// after which the agreement fell (to take it back made errors larger) and the bins of Otsu's threshold, which decides
+/// on when a crowded graph is thinned. In neither mode does ground truth choose between poses, as it does in the released
+/// evaluation, and the resolution is a setting instead of being measured for each pair of clouds.
 ///
 /// The number of maximal cliques explodes where most pairs agree. The work is therefore limited, in counted steps and
 /// not in seconds, so that the result is the same on every machine and for any number of threads. When the limit is
@@ -169,11 +165,11 @@ impl Mac {
     }
 
     /// The best `top` poses of which no two are alike (5 degrees, or twice the inlier threshold at the middle of the
-    /// pairs), each polished, best first. Fewer, if there are no more that at least 7 pairs agree with.
+    /// pairs), best first; the best one polished, the others as their cliques give them. Fewer, if there are no more.
     ///
     /// # Errors
-    /// `InvalidInput` if a setting makes no sense or a pair is not finite; `NoPose` if there are fewer than three pairs,
-    /// no clique, or no pose that 7 pairs agree with.
+    /// `InvalidInput` if a setting makes no sense or a pair is not finite; `NoPose` if there are fewer than three pairs
+    /// or no three of them are consistent.
     pub fn hypotheses(&self, pairs: &[Correspondence], top: usize) -> Result<Vec<PoseEstimate>> {
         self.validate()?;
         consensus::validate(pairs)?;
@@ -287,16 +283,12 @@ impl Mac {
             .map(judged)
             .collect();
         let difference = Difference::new(judges, 2.0 * self.inlier_threshold);
-        // Poses that differ before the polishing may not do so afterwards.
-        let polished = match self.mode {
-            Mode::Faithful => 1,
-            Mode::Fixed => top + SPARE,
-        };
         let mut best = difference.best(candidates, top + SPARE);
-        for hypothesis in best.iter_mut().take(polished) {
-            let start = hypothesis.target_from_source;
-            *hypothesis = judged(agreement.polish(start, self.polish_rounds, self.mode));
+        if let Some(first) = best.first_mut() {
+            let start = first.target_from_source;
+            *first = judged(agreement.polish(start, self.polish_rounds, self.mode));
         }
+        // Polished, the first may have come close to others.
         let best = difference.best(best, top);
         self.estimates(&best, cliques, pairs, top)
     }
@@ -308,6 +300,9 @@ impl Mac {
         pairs: &[Correspondence],
         top: usize,
     ) -> Result<Vec<PoseEstimate>> {
+        if best.is_empty() && top > 0 {
+            return Err(self.no_clique(pairs.len(), cliques));
+        }
         let estimate = |(rank, hypothesis): (usize, &Hypothesis)| {
             let pose = hypothesis.target_from_source;
             PoseEstimate {
@@ -319,17 +314,22 @@ impl Mac {
                 budget_exhausted: cliques.budget_exhausted,
             }
         };
-        let mut estimates: Vec<PoseEstimate> = best.iter().enumerate().map(estimate).collect();
-        let most = estimates.first().map_or(0, |first| first.inliers.len());
-        estimates.retain(|estimate| estimate.inliers.len() >= MIN_INLIERS);
-        if estimates.is_empty() && top > 0 {
-            return Err(Error::no_pose(format!(
-                "{most} of {} correspondences agree with the best of {} cliques, {MIN_INLIERS} must",
-                pairs.len(),
-                cliques.found.len()
-            )));
+        Ok(best.iter().enumerate().map(estimate).collect())
+    }
+
+    fn no_clique(&self, count: usize, cliques: &Cliques) -> Error {
+        let bound = self.bound;
+        if cliques.budget_exhausted && cliques.found.is_empty() {
+            return Error::no_pose(format!(
+                "{} steps are too few to find a clique among {count} correspondences: allow more",
+                self.max_work
+            ));
         }
-        Ok(estimates)
+        Error::no_pose(format!(
+            "no {} of {count} correspondences are consistent with a score above {bound} and determine a pose: give \
+             more or better correspondences or a lower bound",
+            self.min_clique_size
+        ))
     }
 }
 
@@ -351,7 +351,7 @@ fn most_joined(graph: &CompatibilityGraph, count: usize) -> Vec<usize> {
 }
 
 impl PoseEstimator for Mac {
-    /// Uses the pairs alone.
+    /// Uses the pairs alone; `NoPose` also if no more of them agree than random ones would.
     fn estimate(
         &self,
         _source: &PointCloud,
@@ -359,6 +359,9 @@ impl PoseEstimator for Mac {
         pairs: &[Correspondence],
     ) -> Result<PoseEstimate> {
         let best = self.hypotheses(pairs, 2)?.into_iter().next();
-        best.ok_or_else(|| Error::Internal("mac gave neither a pose nor an error".to_owned()))
+        let best =
+            best.ok_or_else(|| Error::Internal("mac gave neither a pose nor an error".to_owned()))?;
+        significance::require(&best.target_from_source, pairs, self.inlier_threshold)?;
+        Ok(best)
     }
 }

@@ -13,6 +13,7 @@ mod densify;
 mod encoded_views;
 mod estimator_properties;
 mod eval;
+mod fast_mac;
 mod fpfh;
 mod hint;
 mod hostile_files;

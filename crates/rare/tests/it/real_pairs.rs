@@ -1,5 +1,7 @@
 //! From two raw clouds to a pose on real indoor pairs: voxel grid, normals, FPFH, nearest neighbours, SC2-PCR, ICP.
 
+use std::sync::LazyLock;
+
 use nalgebra::Point3;
 use rare::data::{KdTree, resolution, voxel_downsample};
 use rare::features::{estimate_normals, fpfh, orient_towards};
@@ -54,6 +56,27 @@ impl Pair {
         let sampled = source.select(&Random::new(seed, 0).sample(1000, source.len()));
         Sc2PcrPlusPlus::for_voxel(VOXEL).correspond(&sampled, target).unwrap()
     }
+}
+
+/// A labelled pair of clouds and sets of matches between them.
+pub(crate) struct Matches {
+    pub(crate) name: &'static str,
+    pub(crate) truth: RigidTransform,
+    /// One for each seed from 1 on.
+    pub(crate) sets: Vec<Vec<Correspondence>>,
+}
+
+/// Ten sets of 1000 random matches for each indoor pair, made once; none where the data are missing.
+pub(crate) fn matches() -> &'static [Matches] {
+    static MATCHES: LazyLock<Vec<Matches>> = LazyLock::new(|| {
+        let matches = |name| {
+            let pair = Pair::open(name)?;
+            let sets = (1..=10).map(|seed| pair.matches(seed).0).collect();
+            Some(Matches { name, truth: pair.truth, sets })
+        };
+        NAMES.into_iter().filter_map(matches).collect()
+    });
+    &MATCHES
 }
 
 #[test]
