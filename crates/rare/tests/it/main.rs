@@ -14,6 +14,8 @@ mod encoded_views;
 mod fpfh;
 mod hint;
 mod hostile_files;
+mod icp;
+mod icp_pairs;
 mod matching;
 mod metrics;
 mod poses;
