@@ -4,8 +4,9 @@ use nalgebra::{Matrix3, Matrix6, Point3, SymmetricEigen, Vector3, Vector6};
 
 use crate::data::RigidTransform;
 
-/// Below this share of the total weight a direction of motion counts as open.
-pub(super) const OPEN_SHARE: f64 = 1e-3;
+/// Below this share of the total weight a direction of motion counts as open: the distances change by less than a tenth
+/// (root mean square) of the motion. Estimated normals err by so much where surfaces meet.
+pub(super) const OPEN_SHARE: f64 = 1e-2;
 
 /// Rows of the lower triangle of a symmetric 6 x 6 matrix.
 const TRIANGLE: usize = 21;
@@ -193,15 +194,16 @@ impl NormalEquations {
         self.step(-damped.cholesky()?.solve(&Vector6::from(self.gradient)))
     }
 
-    /// As [`NormalEquations::solve`], but at rest along open directions: what noise says there is not followed
-    /// (Zhang, Kaess and Singh 2016).
-    pub(super) fn solve_determined(&self, damping: f64) -> Option<Step> {
-        let Some(eigen) = self.eigen().filter(|eigen| eigen.eigenvalues.min() <= self.limit())
-        else {
+    /// As [`NormalEquations::solve`], but at rest along directions whose share of what shifts show is at most `rest`:
+    /// what noise says there is not followed (Zhang, Kaess and Singh 2016).
+    pub(super) fn solve_determined(&self, damping: f64, rest: f64) -> Option<Step> {
+        // The trace of the shifting block: of planes it is the weight.
+        let limit = rest * (self.hessian[9] + self.hessian[14] + self.hessian[20]);
+        let Some(eigen) = self.eigen().filter(|eigen| eigen.eigenvalues.min() <= limit) else {
             return self.solve(damping);
         };
         let gradient = Vector6::from(self.gradient);
-        let determined = (0..6).filter(|&i| eigen.eigenvalues[i] > self.limit());
+        let determined = (0..6).filter(|&i| eigen.eigenvalues[i] > limit);
         self.step(determined.fold(Vector6::zeros(), |step, i| {
             let direction = eigen.eigenvectors.column(i);
             step - direction * (direction.dot(&gradient) / eigen.eigenvalues[i])
@@ -217,8 +219,8 @@ impl NormalEquations {
         })
     }
 
-    /// The eigenvalue at which a direction begins to count as determined.
-    pub(super) fn limit(&self) -> f64 {
+    /// The eigenvalue up to which a direction counts as open.
+    pub(super) fn open_limit(&self) -> f64 {
         OPEN_SHARE * self.weight
     }
 

@@ -19,6 +19,8 @@ mod hint;
 mod hostile_files;
 mod local_to_global;
 mod mac;
+mod icp;
+mod icp_pairs;
 mod matching;
 mod metrics;
 mod poses;

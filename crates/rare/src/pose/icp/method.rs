@@ -4,7 +4,7 @@ use nalgebra::{Point3, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::pose::RobustKernel;
-use crate::pose::normal_equations::{NormalEquations, Step, Symmetric3};
+use crate::pose::normal_equations::{NormalEquations, OPEN_SHARE, Step, Symmetric3};
 
 /// Variance of a surface point across its surface, where its variance along the surface is 1 (Segal et al. 2009).
 const THICKNESS: f64 = 1e-3;
@@ -46,15 +46,16 @@ impl IcpMethod {
         !matches!(self, IcpMethod::PointToPoint | IcpMethod::PointToPlane)
     }
 
-    /// Whether a plane leaves directions open, so that noise must not be followed there. The other methods also pull
-    /// along the surface.
-    fn slides(self) -> bool {
-        matches!(self, IcpMethod::PointToPlane | IcpMethod::Symmetric)
-    }
-
     /// The next step, damped relative to the mean diagonal of the system; `None` if no pair has a say.
     pub(super) fn step(self, sums: &NormalEquations, damping: f64) -> Option<Step> {
-        if self.slides() { sums.solve_determined(damping) } else { sums.solve(damping) }
+        match self {
+            IcpMethod::PointToPoint => sums.solve(damping),
+            IcpMethod::PointToPlane | IcpMethod::Symmetric => {
+                sums.solve_determined(damping, OPEN_SHARE)
+            }
+            // Flat covariances pull along the surface too, with the weight of their thickness.
+            _ => sums.solve_determined(damping, OPEN_SHARE + 2.0 * THICKNESS),
+        }
     }
 
     /// Adds what `pair` says under a kernel of this width (metres) to the sums.

@@ -24,9 +24,9 @@ pub struct IcpResult {
     /// Whether the last stage ended because the step was small.
     pub converged: bool,
     /// The motions that the surfaces leave (nearly) open, those with the least turn first: two shifts and a turn for a
-    /// single plane, a shift for a corridor, three turns for a ball, a shift and a turn for a cylinder. Point-to-plane
-    /// and symmetric ICP rest there; the other methods follow the sampling of the points, so the pose is not to be
-    /// trusted along these motions. Empty if every motion is determined.
+    /// single plane, a shift for a corridor, three turns for a ball, a shift and a turn for a cylinder. All
+    /// methods but point-to-point rest there, so along these motions the pose is as good as the start; point-to-point
+    /// follows the sampling of the points. Empty if every motion is determined.
     pub open_directions: Vec<OpenDirection>,
     /// `J^T W J` of the distances to the tangent planes (between the points, if the target has no normals) for a left
     /// increment `[rotation vector, translation]` at the origin of the target's frame, whatever the method. Divided by
@@ -46,7 +46,7 @@ pub struct OpenDirection {
     pub rotation: Vector3<f64>,
     /// Shift of the centre, metres; about zero for a turn about an axis through it.
     pub translation: Vector3<f64>,
-    /// Mean square change of the distances, square metres, kernel-weighted; at most 0.001, 1 for a motion straight
+    /// Mean square change of the distances, square metres, kernel-weighted; at most 0.01, 1 for a motion straight
     /// across all surfaces.
     pub visibility: f64,
 }
@@ -66,7 +66,7 @@ impl OpenDirection {
 /// The open directions of the sums, in the basis that sets shifts apart from turns.
 pub(super) fn open_directions(sums: &NormalEquations) -> Vec<OpenDirection> {
     let Some(eigen) = sums.eigen() else { return Vec::new() };
-    let open: Vec<usize> = (0..6).filter(|&i| eigen.eigenvalues[i] <= sums.limit()).collect();
+    let open: Vec<usize> = (0..6).filter(|&i| eigen.eigenvalues[i] <= sums.open_limit()).collect();
     if open.is_empty() {
         return Vec::new();
     }
