@@ -2,7 +2,9 @@
 //! nor threads show.
 
 use nalgebra::{Point3, Rotation3, Vector3};
-use rare::pose::{Mode, PoseEstimate, PoseEstimator, Ransac, RansacScore, Sc2Pcr, Sc2PcrPlusPlus};
+use rare::pose::{
+    FastMac, Mac, Mode, PoseEstimate, PoseEstimator, Ransac, RansacScore, Sc2Pcr, Sc2PcrPlusPlus,
+};
 use rare::random::Random;
 use rare::{Correspondence, Error, PointCloud, RigidTransform};
 
@@ -26,6 +28,9 @@ fn estimators() -> Vec<(&'static str, Box<dyn PoseEstimator>)> {
         ("sc2-pcr as released", Box::new(faithful)),
         ("sc2-pcr++", Box::new(plus_plus)),
         ("sc2-pcr++ as released", Box::new(faithful_plus_plus)),
+        ("mac", Box::new(Mac::three_d_match())),
+        ("mac as released", Box::new(Mac { mode: Mode::Faithful, ..Mac::three_d_match() })),
+        ("fast-mac", Box::new(FastMac { ratio: 0.9, ..FastMac::three_d_match() })),
     ]
 }
 
