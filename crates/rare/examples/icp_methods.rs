@@ -5,12 +5,7 @@
 //! A pair holds `src` and `ref` (`N x 3`, `f32`, metres) and `gt` (`4 x 4`, moves `src` onto `ref`). Every method starts
 //! from `gt` disturbed about the centroid of `src` by a fixed turn and shift of DEGREES and METRES, and pairs points up
 //! to DISTANCE apart. `benches/peers/icp.py` runs this and other libraries on the same starts.
-#![expect(
-    clippy::print_stdout,
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    reason = "a measuring program"
-)]
+#![expect(clippy::print_stdout, clippy::unwrap_used, reason = "a measuring program")]
 
 use nalgebra::{Matrix4, Point3, Rotation3, Vector3};
 use rare::RigidTransform;

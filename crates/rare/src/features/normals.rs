@@ -70,7 +70,7 @@ fn scatter(points: &[Point3<f64>], centre: &Point3<f64>, found: &[Neighbour]) ->
 ///
 /// Closed form after Eberly, A robust eigensolver for 3 x 3 symmetric matrices (2014): the eigenvector that is separated
 /// best comes first, the others are sought in its orthogonal complement.
-fn smallest_eigenvector(matrix: &Matrix3<f64>) -> Vector3<f64> {
+pub(crate) fn smallest_eigenvector(matrix: &Matrix3<f64>) -> Vector3<f64> {
     let scale = matrix.amax();
     if scale == 0.0 || matrix.iter().any(|value| !value.is_finite()) {
         return Vector3::zeros();

@@ -224,7 +224,7 @@ impl Icp {
 /// The evidence at a pose.
 fn evaluate(run: &mut Run<'_>, pose: RigidTransform, last: &IcpStage) -> Result<IcpResult> {
     let own = run.round(&pose, last);
-    let fit = run.fit(&pose, last);
+    let fit = run.fit();
     if own.weight <= 0.0 || fit.matched == 0 {
         return Err(Error::no_pose(format!(
             "no source point lies within {} m of a target point that icp can use (one with a normal, if the method needs it)",

@@ -1,4 +1,4 @@
-//! Generalised and point-to-plane ICP on real pairs, beside what Open3D and small_gicp reach from the same starts.
+//! Generalised and point-to-plane ICP on real pairs, beside what Open3D and `small_gicp` reach from the same starts.
 
 use nalgebra::{Rotation3, Vector3};
 use rare::RigidTransform;
@@ -11,7 +11,7 @@ use crate::shared::{self, Golden};
 const VOXEL: f64 = 0.05;
 
 /// Rotation (degrees) and translation (metres) errors of Open3D 0.20.0's point-to-plane ICP, and the lower of those of
-/// its generalised ICP and small_gicp 1.0.1's: `python crates/rare/benches/peers/icp.py PAIR.npz ...`.
+/// its generalised ICP and `small_gicp` 1.0.1's: `python crates/rare/benches/peers/icp.py PAIR.npz ...`.
 const PEERS: [(&str, [f64; 2], [f64; 2]); 5] = [
     ("geo_demo", [2.345, 0.1223], [1.666, 0.1158]),
     ("kitchen_0_4_raw", [1.941, 0.0509], [1.464, 0.0353]),

@@ -3,10 +3,11 @@
 use std::collections::HashMap;
 use std::hash::BuildHasherDefault;
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Matrix3, Point3, Vector3};
 
 use crate::data::{Cell, CellHasher, VoxelGrid};
 use crate::error::Result;
+use crate::features::smallest_eigenvector;
 use crate::pose::icp::method::covariance_across;
 use crate::pose::normal_equations::Symmetric3;
 
@@ -23,6 +24,8 @@ pub(crate) struct GaussianVoxels {
 pub(crate) struct GaussianVoxel {
     pub(super) mean: Point3<f64>,
     pub(super) covariance: Symmetric3,
+    /// Across the surface: the direction of least variance.
+    pub(super) normal: Vector3<f64>,
 }
 
 impl GaussianVoxels {
@@ -101,6 +104,11 @@ impl VoxelSums {
             yz: sum.yz / count,
             zz: sum.zz / count,
         };
-        GaussianVoxel { mean: self.first + self.offset / count, covariance }
+        let c = &covariance;
+        let dense = Matrix3::new(c.xx, c.xy, c.xz, c.xy, c.yy, c.yz, c.xz, c.yz, c.zz);
+        // Where no point has a normal the covariance is the identity, and there is no surface.
+        let known = dense != Matrix3::identity();
+        let normal = if known { smallest_eigenvector(&dense) } else { Vector3::zeros() };
+        GaussianVoxel { mean: self.first + self.offset / count, covariance, normal }
     }
 }

@@ -5,7 +5,8 @@ use nalgebra::{DMatrix, Matrix6, Point3, Vector3};
 use crate::data::RigidTransform;
 use crate::pose::normal_equations::NormalEquations;
 
-/// An aligned pose and its evidence, all evaluated at exactly this pose with the last stage's settings.
+/// An aligned pose and its evidence, all evaluated at exactly this pose with the last stage's settings. The target
+/// points of the voxelised method are the means of its voxels.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IcpResult {
     /// Moves points of the source into the target's frame.

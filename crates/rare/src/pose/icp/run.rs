@@ -152,25 +152,25 @@ impl<'a> Run<'a> {
         Run { icp, points, normals, target, centroid, spread, finite: number, matches }
     }
 
+    /// The voxels, if points are matched with them.
+    fn voxels(&self) -> Option<&'a GaussianVoxels> {
+        self.target.voxels().filter(|_| self.icp.method == IcpMethod::VoxelisedGeneralised)
+    }
+
     /// Matches all points under `pose` and sums up what the pairs say.
     pub(super) fn round(&mut self, pose: &RigidTransform, stage: &IcpStage) -> NormalEquations {
-        let method = self.icp.method;
-        match self.target.voxels().filter(|_| method == IcpMethod::VoxelisedGeneralised) {
+        match self.voxels() {
             Some(voxels) => self.match_each(pose, |found, moved| {
                 found.with_voxel(moved, voxels, stage.max_distance);
             }),
             None => self.match_points(pose, stage),
         }
         let limit = self.trim_limit();
-        self.sums(method, pose, stage, limit)
+        self.sums(self.icp.method, pose, stage, limit)
     }
 
-    /// Matches all points with their nearest target points, whatever the method.
-    pub(super) fn fit(&mut self, pose: &RigidTransform, stage: &IcpStage) -> Fit {
-        if self.icp.method == IcpMethod::VoxelisedGeneralised {
-            self.matches.fill(Match::UNSOUGHT);
-        }
-        self.match_points(pose, stage);
+    /// Counts what the last round matched.
+    pub(super) fn fit(&self) -> Fit {
         let limit = self.trim_limit();
         let mut fit = Fit { limit, ..Fit::default() };
         for found in self.matches.iter().filter(|found| found.squared_distance.is_finite()) {
@@ -221,7 +221,12 @@ impl<'a> Run<'a> {
     ) -> NormalEquations {
         let empty = NormalEquations::new(pose.apply(&self.centroid), self.spread);
         let turned = if method.needs_source_normals() { self.normals } else { &[] };
-        let adder = Adder { method, kernel: self.icp.kernel, width: stage.kernel_width };
+        let adder = Adder {
+            method,
+            voxels: self.voxels(),
+            kernel: self.icp.kernel,
+            width: stage.kernel_width,
+        };
         let starts = (0..self.matches.len()).into_par_iter().step_by(CHUNK);
         let sums: Vec<NormalEquations> = (self.matches.par_chunks(CHUNK))
             .zip(starts)
@@ -242,13 +247,15 @@ impl<'a> Run<'a> {
 }
 
 /// How a pair enters the sums.
-struct Adder {
+struct Adder<'a> {
     method: IcpMethod,
+    /// If partners are voxels.
+    voxels: Option<&'a GaussianVoxels>,
     kernel: RobustKernel,
     width: f64,
 }
 
-impl Adder {
+impl Adder<'_> {
     #[inline]
     fn add(
         &self,
@@ -258,10 +265,14 @@ impl Adder {
         target: &IcpTarget,
     ) {
         let (moved, partner) = (found.moved, found.partner as usize);
-        if self.method == IcpMethod::VoxelisedGeneralised {
-            if let Some(voxel) = target.voxels().and_then(|voxels| voxels.get(partner)) {
+        if let Some(voxel) = self.voxels.and_then(|voxels| voxels.get(partner)) {
+            if self.method == IcpMethod::VoxelisedGeneralised {
                 let metric = voxel_to_plane(&voxel.covariance, moved_normal);
                 add_difference(sums, &moved, &voxel.mean, &metric, self.kernel, self.width);
+            } else {
+                let (target, target_normal) = (voxel.mean, voxel.normal);
+                let pair = Pair { moved, target, moved_normal: *moved_normal, target_normal };
+                self.method.add(sums, &pair, self.kernel, self.width);
             }
             return;
         }
