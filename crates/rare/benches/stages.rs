@@ -2,6 +2,7 @@
 //!
 //! `RARE_BENCH_PAIR` names an `.npz` file with the arrays `src` and `ref` (`N x 3`, `f32`) to measure on, and
 //! `RARE_BENCH_VOXEL` the sampling distance in metres (0.05 if unset); without a pair the points are synthetic.
+//! `RARE_BENCH_MATCHES` names one whose arrays are matched row by row; without it a tenth of 1000 matches is right.
 use std::sync::LazyLock;
 
 use divan::Bencher;
@@ -81,6 +82,14 @@ fn correspondences(count: usize) -> Vec<Correspondence> {
         Correspondence { source, target, score: 1.0 }
     };
     (0..count).map(&mut pair).collect()
+}
+
+fn matches() -> Vec<Correspondence> {
+    let Some(path) = std::env::var_os("RARE_BENCH_MATCHES") else { return correspondences(1000) };
+    let points = |name| read(&path, name).unwrap_or_default();
+    (points("src").into_iter().zip(points("ref")))
+        .map(|(source, target)| Correspondence { source, target, score: 1.0 })
+        .collect()
 }
 
 fn motion() -> RigidTransform {
@@ -183,6 +192,24 @@ fn mac(bencher: Bencher, count: usize) {
 #[divan::bench(args = [250, 1000, 2500])]
 fn fast_mac(bencher: Bencher, count: usize) {
     let pairs = correspondences(count);
+    bencher.bench(|| FastMac::three_d_match().hypotheses(&pairs, 2));
+}
+
+#[divan::bench]
+fn mac_of_matches(bencher: Bencher) {
+    let pairs = matches();
+    bencher.bench(|| Mac::three_d_match().hypotheses(&pairs, 2));
+}
+
+#[divan::bench]
+fn mac_of_matches_at_a_low_bound(bencher: Bencher) {
+    let pairs = matches();
+    bencher.bench(|| Mac::three_d_lo_match().hypotheses(&pairs, 2));
+}
+
+#[divan::bench]
+fn fast_mac_of_matches(bencher: Bencher) {
+    let pairs = matches();
     bencher.bench(|| FastMac::three_d_match().hypotheses(&pairs, 2));
 }
 

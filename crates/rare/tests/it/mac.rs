@@ -111,16 +111,26 @@ fn the_number_of_threads_does_not_show() {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         pool.install(|| settings.hypotheses(pairs, 3).unwrap())
     };
-    let sparse = synthetic(700, 0.1, &motion(), 8);
-    let dense = synthetic(300, 0.9, &motion(), 9);
-    let limited = Mac { max_work: 3_000_000, ..Mac::three_d_lo_match() };
-    for (settings, pairs, exhausted) in
-        [(Mac::three_d_match(), &sparse, false), (limited, &dense, true)]
-    {
-        let found = run(1, &settings, pairs);
-        assert_eq!(found, run(2, &settings, pairs));
+    let (exploding, limited) = exploding();
+    for (settings, pairs, exhausted) in [
+        (Mac::three_d_match(), synthetic(700, 0.1, &motion(), 8), false),
+        (Mac { max_work: 30_000_000, ..limited }, exploding, true),
+    ] {
+        let found = run(1, &settings, &pairs);
+        assert_eq!(found, run(2, &settings, &pairs));
         assert_eq!(found[0].budget_exhausted, exhausted);
     }
+}
+
+/// Pairs that all agree about as well, so that the coefficients hardly differ and the graph is not reduced, and settings
+/// that cannot enumerate its cliques.
+fn exploding() -> (Vec<Correspondence>, Mac) {
+    let mut pairs = synthetic(400, 1.0, &motion(), 13);
+    for pair in &mut pairs {
+        let exact = motion().apply(&pair.source);
+        pair.target = exact + (pair.target - exact) * 0.4;
+    }
+    (pairs, Mac::three_d_match())
 }
 
 #[test]
@@ -129,8 +139,8 @@ fn a_limit_on_the_work_is_reported_and_leaves_a_good_pose() {
     let settings = Mac::three_d_lo_match();
     // From enough for all, over too little for all cliques or for the first graph, to too little for any graph.
     for (max_work, max_cliques, exhausted) in [
-        (settings.max_work, settings.max_cliques, false),
-        (settings.max_work, 500, true),
+        (300_000_000, settings.max_cliques, false),
+        (300_000_000, 500, true),
         (20_000_000, settings.max_cliques, true),
         (5_000_000, settings.max_cliques, true),
     ] {
@@ -140,19 +150,19 @@ fn a_limit_on_the_work_is_reported_and_leaves_a_good_pose() {
         assert!(error.rotation_degrees < 0.1 && error.translation < 0.005, "{error:?}");
         assert_eq!(found.budget_exhausted, exhausted, "{max_work} {max_cliques}");
     }
+    // Wrong pairs first: those that stand for all, 400 of 550 without noise, have other numbers among themselves.
+    let mut exact = synthetic(1000, 0.0, &motion(), 14);
+    exact[450..].iter_mut().for_each(|pair| pair.target = motion().apply(&pair.source));
+    let found = solve(&Mac { max_work: 100_000_000, ..settings.clone() }, &exact);
+    assert!(found.budget_exhausted && found.inliers.iter().filter(|&&i| i >= 450).count() == 550);
     let nothing = Mac { max_work: 0, ..settings };
     assert!(nothing.hypotheses(&pairs, 1).unwrap_err().to_string().contains("0 steps"));
 }
 
 #[test]
 fn an_explosion_of_cliques_is_survived() {
-    // Where all agree about as well, the coefficients hardly differ and the graph is not reduced.
-    let mut pairs = synthetic(400, 1.0, &motion(), 13);
-    for pair in &mut pairs {
-        let exact = motion().apply(&pair.source);
-        pair.target = exact + (pair.target - exact) * 0.4;
-    }
-    let found = solve(&Mac { max_work: 100_000_000, ..Mac::three_d_match() }, &pairs);
+    let (pairs, settings) = exploding();
+    let found = solve(&settings, &pairs);
     let error = found.target_from_source.error_to(&motion());
     println!("{error:?}, {} cliques, {} inliers", found.iterations, found.inliers.len());
     assert!(error.rotation_degrees < 0.1 && error.translation < 0.005, "{error:?}");

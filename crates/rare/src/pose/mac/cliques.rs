@@ -10,10 +10,13 @@ use crate::pose::mac::score_graph::ScoreGraph;
 
 const WORD: usize = u64::BITS as usize;
 
+/// Steps that a word of a set counts for: to combine and count it takes about as long as to follow so many edges.
+const STEPS_PER_WORD: u64 = 4;
+
 /// Limits on a search, or what one has used of them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Budget {
-    /// Steps: words of bit sets that are combined, edges that are looked at.
+    /// Steps: edges that are looked at, and four for each word of a bit set that is combined.
     pub(super) work: u64,
     /// Maximal cliques that are found.
     pub(super) cliques: u64,
@@ -212,7 +215,7 @@ impl CliqueSearch {
         }
         above[stride + next / WORD] &= !(1 << (next % WORD));
         above[2 * stride + next / WORD] |= 1 << (next % WORD);
-        self.used.work += 2 * stride as u64;
+        self.used.work += STEPS_PER_WORD * 2 * stride as u64;
         (left, closed)
     }
 
@@ -232,7 +235,7 @@ impl CliqueSearch {
         let mut best = (0, 0);
         for i in ones(excluded).chain(ones(candidates)) {
             let count = joined(i);
-            self.used.work += words as u64;
+            self.used.work += STEPS_PER_WORD * words as u64;
             if best.0 == 0 || count > best.1 {
                 best = (i + 1, count);
             }

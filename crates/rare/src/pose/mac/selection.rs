@@ -222,11 +222,17 @@ mod tests {
         let found = enumerate(&graph, 3);
         let sizes: Vec<usize> = found.iter().map(|(clique, _)| clique.len()).collect();
         assert_eq!(sizes, [100, 100]);
-        let outside = enumerate(&samples::random_graph(150, 0.3, 5), 3);
-        let mut unique = outside.clone();
+        let random = samples::random_graph(150, 0.3, 5);
+        let found = enumerate(&random, 3);
+        let mut unique = found.clone();
         unique.dedup_by(|a, b| a.0 == b.0);
-        assert_eq!(unique.len(), outside.len());
+        assert_eq!(unique.len(), found.len());
         assert!(unique.len() > 1000);
+        for (clique, _) in &unique {
+            let row = |&i: &u32| random.neighbours(i as usize);
+            let joined_to_all = |i: &u32| clique.iter().all(|member| row(member).contains(i));
+            assert!(!(0..150).any(|i| joined_to_all(&i)), "{clique:?} is not maximal");
+        }
     }
 
     #[test]
