@@ -3,6 +3,7 @@
 //! Pass 1 works on the pairs and writes what methods found into a folder of results; pass 2 scores the folder. Nothing
 //! that pass 2 prints depends on who found a result, when, or in which order.
 
+mod listed;
 mod method;
 mod paper;
 mod start;
@@ -84,8 +85,8 @@ fn read_dataset(args: &EvalArgs) -> Result<Dataset> {
     let mut dataset = match args.dataset {
         DatasetKind::Folder => dataset::read_folder(&args.root, &args.pairs, &args.truth)?,
         DatasetKind::Paper => bail!("the paper's tables are no single benchmark"),
-        DatasetKind::ThreeDMatch => dataset::read_three_d_match(&args.root, "3DMatch")?,
-        DatasetKind::ThreeDLoMatch => dataset::read_three_d_match(&args.root, "3DLoMatch")?,
+        DatasetKind::ThreeDMatch => listed::read_three_d_match(&args.root, "3DMatch")?,
+        DatasetKind::ThreeDLoMatch => listed::read_three_d_match(&args.root, "3DLoMatch")?,
         DatasetKind::Kitti => dataset::read_kitti(&args.root, args.kitti_gt.into())?,
     };
     if let Some(limit) = args.limit {

@@ -10,6 +10,7 @@ use rare::nalgebra::{Rotation3, Vector3};
 use rare::random::Random;
 use serde_json::{Value, json};
 
+use crate::pickle_writer::Pickle;
 use crate::shared::{Workplace, argument, pair, shifted, start};
 
 /// Pairs of the benchmark.
@@ -279,4 +280,77 @@ fn the_papers_tables_are_filled_as_far_as_the_data_goes() {
     for file in ["out/paper.md", "out/paper.tex", "out/3DMatch-geotransformer/results.jsonl"] {
         assert!(workplace.path(file).is_file(), "{file}");
     }
+}
+
+#[test]
+fn a_list_of_pairs_stands_for_a_missing_log() {
+    let workplace = benchmark();
+    fs::create_dir_all(workplace.path("data/metadata")).unwrap();
+    fs::create_dir_all(workplace.path("data/data/test/room")).unwrap();
+    let pairs: Vec<Value> = serde_json::from_str(&workplace.text("room/pairs.json")).unwrap();
+    let row = |index: usize| -> Vec<f64> {
+        pairs[0]["gt"][index]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|value| value.as_f64().unwrap())
+            .collect()
+    };
+    let rows = [row(0), row(1), row(2)];
+    let rotation: Vec<f64> = rows.iter().flat_map(|row| row[..3].to_vec()).collect();
+    let translation: Vec<f64> = rows.iter().map(|row| row[3]).collect();
+    let list = Pickle(b"](}(".to_vec())
+        .text("overlap")
+        .number(0.9)
+        .text("pcd0")
+        .text("test/room/cloud_bin_0.pth")
+        .text("pcd1")
+        .text("test/room/cloud_bin_1.pth")
+        .text("rotation")
+        .array(&[3, 3], &rotation)
+        .text("translation")
+        .array(&[3], &translation)
+        .text("scene_name")
+        .text("room")
+        .text("frag_id0")
+        .integer(0)
+        .text("frag_id1")
+        .integer(1)
+        .raw(b"ue");
+    workplace.write("data/metadata/3DMatch.pkl", list.into_file());
+    for number in [0, 1] {
+        let points =
+            rare::io::read_cloud(workplace.path(&format!("room/cloud_bin_{number}.ply"))).unwrap();
+        // A pickle's small integers reach to 255.
+        let points: Vec<f64> = points
+            .world_points()
+            .iter()
+            .step_by(40)
+            .take(200)
+            .flat_map(|point| [point.x, point.y, point.z])
+            .collect();
+        let fragment = Pickle(Vec::new()).array(&[200, 3], &points).into_file();
+        workplace.write(&format!("data/data/test/room/cloud_bin_{number}.pth"), fragment);
+    }
+    let outcome = workplace.run(&[
+        "eval",
+        "3dmatch",
+        "data",
+        "--init",
+        "ransac",
+        "--methods",
+        "point-to-point",
+        "--out",
+        "out",
+        "--quiet",
+    ]);
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    assert!(outcome.stdout.starts_with("protocol dgr"), "{outcome:?}");
+    assert_eq!(lines(&workplace, "out").len(), 1);
+    fs::remove_file(workplace.path("data/data/test/room/cloud_bin_1.pth")).unwrap();
+    workplace.run(&["eval", "3dmatch", "data", "--out", "out2"]).assert_refused(&[
+        "3DMatch.pkl",
+        "cloud_bin_1.pth",
+        "missing",
+    ]);
 }

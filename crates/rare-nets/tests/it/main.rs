@@ -13,6 +13,7 @@ mod engine;
 mod network_shapes;
 mod networks;
 mod official;
+mod pickle_writer;
 mod pipeline;
 mod reference_backend;
 mod sampler;

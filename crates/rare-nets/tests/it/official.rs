@@ -4,6 +4,7 @@ use std::io::Write;
 
 use rare_nets::official::{is_fragment, read_fragment, read_pairs};
 
+use crate::pickle_writer::Pickle;
 use crate::shared;
 
 #[test]
@@ -37,56 +38,11 @@ fn fragments_of_every_container_are_clouds() {
     }
 }
 
-/// A pickle of protocol 2, put together from the operations that Python writes.
-struct Pickle(Vec<u8>);
-
-impl Pickle {
-    fn text(mut self, text: &str) -> Pickle {
-        self.0.push(b'X');
-        self.0.extend((text.len() as u32).to_le_bytes());
-        self.0.extend(text.as_bytes());
-        self
-    }
-
-    fn number(mut self, number: f64) -> Pickle {
-        self.0.push(b'G');
-        self.0.extend(number.to_be_bytes());
-        self
-    }
-
-    fn integer(mut self, number: u8) -> Pickle {
-        self.0.extend([b'K', number]);
-        self
-    }
-
-    fn raw(mut self, bytes: &[u8]) -> Pickle {
-        self.0.extend(bytes);
-        self
-    }
-
-    /// `numpy.core.multiarray._reconstruct(ndarray, (0,), b'b')` and its state.
-    fn array(self, shape: &[u8], values: &[f64]) -> Pickle {
-        let mut pickle = self
-            .raw(b"cnumpy.core.multiarray\n_reconstruct\n")
-            .raw(b"cnumpy\nndarray\nK\x00\x85C\x01b\x87R(K\x01(");
-        for &length in shape {
-            pickle = pickle.integer(length);
-        }
-        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
-        let mut pickle = pickle
-            .raw(b"tcnumpy\ndtype\nX\x02\x00\x00\x00f8K\x00K\x01\x87R(K\x03X\x01\x00\x00\x00<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89");
-        pickle.0.push(b'B');
-        pickle.0.extend((bytes.len() as u32).to_le_bytes());
-        pickle.0.extend(bytes);
-        pickle.raw(b"tb")
-    }
-}
-
 const TURN: [f64; 9] = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 
 fn file(pickle: Pickle) -> tempfile::NamedTempFile {
     let mut file = tempfile::Builder::new().suffix(".pkl").tempfile().unwrap();
-    file.write_all(&[&b"\x80\x03"[..], &pickle.0, b"."].concat()).unwrap();
+    file.write_all(&pickle.into_file()).unwrap();
     file
 }
 

@@ -188,3 +188,91 @@ fn a_written_log_is_read_back_exactly() {
     assert_eq!((blocks.len(), blocks[0].first, blocks[0].second), (1, 3, 7));
     assert_eq!(blocks[0].matrix, matrix);
 }
+
+/// A drive straight ahead, a metre per scan: three sequences of 30 scans.
+fn drive(folder: &Path) {
+    std::fs::create_dir_all(folder.join("poses")).unwrap();
+    for sequence in ["08", "09", "10"] {
+        let base = folder.join("sequences").join(sequence);
+        std::fs::create_dir_all(base.join("velodyne")).unwrap();
+        let poses: String = (0..30).map(|z| format!("1 0 0 0 0 1 0 0 0 0 1 {z}\n")).collect();
+        std::fs::write(folder.join(format!("poses/{sequence}.txt")), poses).unwrap();
+        std::fs::write(base.join("calib.txt"), "P0: 1\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
+        for frame in 0..30 {
+            std::fs::write(base.join(format!("velodyne/{frame:06}.bin")), [0; 16]).unwrap();
+        }
+    }
+}
+
+#[test]
+fn kitti_is_listed_and_its_truth_is_that_of_the_calibration() {
+    use rare::eval::dataset::{KittiTruth, read_kitti};
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path().join("dataset");
+    drive(&root);
+    // The root may be the folder above.
+    let exact = read_kitti(folder.path(), KittiTruth::Exact).unwrap();
+    let pairs: Vec<(&str, usize, usize)> = (exact.pairs.iter())
+        .map(|pair| (pair.truth.scene.as_str(), pair.truth.source, pair.truth.reference))
+        .collect();
+    // The eleventh scan is the first more than 10 m away.
+    let of = |scene| [(scene, 0, 10), (scene, 11, 21)];
+    assert_eq!(pairs, [of("08"), of("09"), of("10")].concat());
+    assert_eq!(exact.protocol, Protocol::Kitti2m);
+    assert!(exact.pairs[0].source.ends_with("sequences/08/velodyne/000000.bin"));
+    // The camera looks along the scanner's x: what was 10 m ahead is beside the car.
+    let truth = exact.pairs[0].truth.target_from_source;
+    assert!((truth[(0, 3)] + 10.0).abs() < 1e-12 && truth[(1, 3)].abs() < 1e-12, "{truth}");
+    let official = read_kitti(&root, KittiTruth::Official).unwrap();
+    let truth = official.pairs[0].truth.target_from_source;
+    assert!((truth[(0, 3)] + 10.0).abs() < 0.02 && truth[(1, 3)].abs() > 1e-3, "{truth}");
+
+    // A refined truth beside the data wins, for the official one alone.
+    std::fs::create_dir(root.join("icp")).unwrap();
+    let mut refined = nalgebra::Matrix4::identity();
+    refined[(0, 3)] = -9.5;
+    let text = rare::io::format_pose(&rare::RigidTransform::from_matrix(&refined).unwrap());
+    std::fs::write(root.join("icp/8_0_10.npy"), text).unwrap();
+    let official = read_kitti(&root, KittiTruth::Official).unwrap();
+    assert_eq!(official.pairs[0].truth.target_from_source, refined);
+
+    let calibration = root.join("sequences/09/calib.txt");
+    std::fs::write(&calibration, "Tr: 0 -1 0\n").unwrap();
+    let message = read_kitti(&root, KittiTruth::Exact).unwrap_err().to_string();
+    assert!(message.contains("09/calib.txt") && message.contains("line 1"), "{message}");
+    std::fs::remove_file(root.join("poses/10.txt")).unwrap();
+    let message = read_kitti(&root, KittiTruth::Official).unwrap_err().to_string();
+    assert!(message.contains("10.txt"), "{message}");
+}
+
+#[test]
+fn fragments_are_found_in_the_known_layouts() {
+    use rare::eval::dataset::read_three_d_match;
+    let identity = "0 2 9\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n";
+    let zeros = "0 0 0 0 0 0\n".repeat(6);
+    for (truth, fragments) in [
+        ("metadata/benchmarks/3DLoMatch/kitchen", "data/test/kitchen/cloud_bin_N.pth"),
+        ("gt_result/kitchen-evaluation", "fragments/kitchen/cloud_bin_N.ply"),
+        ("kitchen-evaluation", "kitchen/cloud_bin_N.ply"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let truth = folder.path().join(truth);
+        std::fs::create_dir_all(&truth).unwrap();
+        std::fs::write(truth.join("gt.log"), identity).unwrap();
+        std::fs::write(truth.join("gt.info"), format!("0 2 9\n{zeros}")).unwrap();
+        let message = read_three_d_match(folder.path(), "3DLoMatch").unwrap_err().to_string();
+        assert!(message.contains("fragment 2") && message.contains("kitchen"), "{message}");
+        for number in ["0", "2"] {
+            let file = folder.path().join(fragments.replace('N', number));
+            std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+            std::fs::write(file, "x").unwrap();
+        }
+        let dataset = read_three_d_match(folder.path(), "3DLoMatch").unwrap();
+        assert_eq!(dataset.pairs.len(), 1);
+        assert!(dataset.pairs[0].source.ends_with(fragments.replace('N', "2")));
+        assert!(dataset.pairs[0].reference.ends_with(fragments.replace('N', "0")));
+    }
+    let nothing = tempfile::tempdir().unwrap();
+    let message = read_three_d_match(nothing.path(), "3DMatch").unwrap_err().to_string();
+    assert!(message.contains("no 3DMatch") && message.contains("benchmarks/3DMatch"), "{message}");
+}

@@ -10,6 +10,7 @@ use rare::eval::dataset::{self, Dataset, KittiTruth};
 use rare::eval::results::{self, ResultsFolder};
 use rare::eval::{Comparison, MethodResult, Table};
 
+use super::listed;
 use super::method::Method;
 use super::start::Starts;
 use super::{Plan, work};
@@ -189,7 +190,7 @@ fn reason(note: &str) -> Option<&str> {
 fn read_benchmark(name: &str, args: &EvalArgs) -> Result<Dataset> {
     let mut dataset = match name {
         "KITTI" => dataset::read_kitti(&args.root, KittiTruth::from(args.kitti_gt))?,
-        name => dataset::read_three_d_match(&args.root, name)?,
+        name => listed::read_three_d_match(&args.root, name)?,
     };
     dataset.pairs.truncate(args.limit.unwrap_or(usize::MAX));
     Ok(dataset)
