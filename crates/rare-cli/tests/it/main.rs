@@ -9,7 +9,6 @@ mod features;
 mod options;
 mod outputs;
 #[path = "../../../rare-nets/tests/it/pickle_writer.rs"]
-#[expect(dead_code, reason = "shared with the tests of the library, which write more")]
 mod pickle_writer;
 mod readme;
 mod registration;
