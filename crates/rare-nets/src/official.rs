@@ -1,13 +1,15 @@
 //! What people have from the official repositories: fragments and lists of pairs as pickles, read as data.
 //!
 //! Fragments of 3DMatch are arrays `N x 3` (`.pth`); lists of pairs are a dictionary of lists (Predator's
-//! `configs/indoor/3DMatch.pkl`) or a list of dictionaries (GeoTransformer's `metadata/3DMatch.pkl`).
+//! `configs/indoor/3DMatch.pkl`) or a list of dictionaries (GeoTransformer's `metadata/3DMatch.pkl`). What test runs of
+//! CoFiNet and Predator saved of each pair becomes correspondences.
 
 use std::path::Path;
 
 use rare::eval::TruePair;
+use rare::matching::{correspondences, nearest};
 use rare::nalgebra::{Matrix4, Point3};
-use rare::{Error, PointCloud, Result};
+use rare::{Correspondence, Error, PointCloud, PointFeatures, Result};
 
 use crate::checkpoint::{Object, open_pickle};
 
@@ -36,6 +38,107 @@ pub fn read_fragment(path: &Path) -> Result<PointCloud> {
     let values = tensor.read_f64()?;
     let points = values.chunks_exact(columns).map(|row| Point3::new(row[0], row[1], row[2]));
     PointCloud::new(points.collect()).map_err(|error| Error::in_file(path, error))
+}
+
+/// Keypoints taken from each cloud of a dump of Predator, those with the highest scores.
+const KEYPOINTS: usize = 1000;
+
+/// Reads the correspondences of a pair from a dump of CoFiNet's or Predator's test run (`N.pth`), best first, each side
+/// in its cloud's frame, metres.
+///
+/// CoFiNet saves its correspondences (`src_pcd`, `tgt_pcd`, indices `correspondences` and `confidence`). Predator saves
+/// points with features and scores (`pcd`, `feats`, `overlaps`, `saliency`, `len_src`): there the 1000 points of
+/// each cloud with the highest overlap times saliency are matched, each source point to its nearest feature.
+///
+/// # Errors
+/// `Io`, `InvalidInput` or `Unsupported` if the file is neither, or its parts do not fit.
+pub fn read_network_dump(path: &Path) -> Result<Vec<Correspondence>> {
+    let object = open_pickle(path)?;
+    let mut pairs = if object.get("correspondences").is_some() {
+        of_cofinet(&object)
+    } else {
+        of_predator_dump(&object)
+    }
+    .map_err(|why| Error::in_file(path, why))?;
+    pairs.sort_by(|a, b| b.score.total_cmp(&a.score));
+    Ok(pairs)
+}
+
+fn of_cofinet(object: &Object) -> std::result::Result<Vec<Correspondence>, String> {
+    let source = points_of(&rows(object, "src_pcd", 3)?);
+    let target = points_of(&rows(object, "tgt_pcd", 3)?);
+    let indices = rows(object, "correspondences", 2)?;
+    let confidence = rows(object, "confidence", 1)?;
+    if confidence.len() * 2 != indices.len() {
+        return Err("as many correspondences as confidences are expected".to_owned());
+    }
+    let point = |points: &[Point3<f64>], index: f64| {
+        let found = (index >= 0.0).then(|| points.get(index as usize).copied()).flatten();
+        found.ok_or_else(|| format!("a correspondence names point {index} of {}", points.len()))
+    };
+    (indices.chunks_exact(2).zip(&confidence))
+        .map(|(pair, score)| {
+            let (source, target) = (point(&source, pair[0])?, point(&target, pair[1])?);
+            Ok(Correspondence { source, target, score: *score })
+        })
+        .collect()
+}
+
+fn of_predator_dump(object: &Object) -> std::result::Result<Vec<Correspondence>, String> {
+    let points = points_of(&rows(object, "pcd", 3)?);
+    let scores: Vec<f64> = (rows(object, "overlaps", 1)?.iter())
+        .zip(rows(object, "saliency", 1)?)
+        .map(|(overlap, saliency)| overlap * saliency)
+        .collect();
+    let (values, dimension) = table(object, "feats")?;
+    let split =
+        object.get("len_src").and_then(Object::integer).and_then(|n| usize::try_from(n).ok());
+    let split =
+        split.filter(|&split| split <= points.len()).ok_or("len_src is no number of points")?;
+    if scores.len() != points.len() || values.len() != points.len() * dimension {
+        return Err("points, features and scores are not equally many".to_owned());
+    }
+    let best = |range: std::ops::Range<usize>| {
+        let mut indices: Vec<usize> = range.collect();
+        indices.sort_by(|&a, &b| scores[b].total_cmp(&scores[a]));
+        indices.truncate(KEYPOINTS);
+        let features = indices.iter().flat_map(|&index| &values[index * dimension..][..dimension]);
+        let features = features.map(|&value| value as f32).collect();
+        let points = indices.iter().map(|&index| points[index]).collect();
+        PointFeatures::new(points, dimension, features).map_err(|error| error.to_string())
+    };
+    let (source, target) = (best(0..split)?, best(split..points.len())?);
+    let matches = nearest(&source, &target, None).map_err(|error| error.to_string())?;
+    Ok(correspondences(&source, &target, &matches, 1))
+}
+
+/// The numbers of an array, which has so many columns (1: any shape), all finite.
+fn rows(object: &Object, key: &str, columns: usize) -> std::result::Result<Vec<f64>, String> {
+    let (values, found) = table(object, key)?;
+    if columns > 1 && found != columns {
+        return Err(format!("{key} has {found} columns instead of {columns}"));
+    }
+    Ok(values)
+}
+
+/// The numbers of an array and its columns.
+fn table(object: &Object, key: &str) -> std::result::Result<(Vec<f64>, usize), String> {
+    let tensor = object.get(key).and_then(Object::tensor);
+    let tensor =
+        tensor.ok_or_else(|| format!("no array {key}: this is no dump of CoFiNet or Predator"))?;
+    let columns = tensor.shape().get(1).copied().unwrap_or(1);
+    let values = tensor.read_f64().or_else(|_| -> Result<Vec<f64>> {
+        Ok(tensor.read_i64()?.into_iter().map(|value| value as f64).collect())
+    });
+    let values = values.map_err(|error| format!("{key}: {error}"))?;
+    match values.iter().all(|value| value.is_finite()) {
+        true => Ok((values, columns)),
+        false => Err(format!("{key} has numbers that are not finite")),
+    }
+}
+
+fn points_of(values: &[f64]) -> Vec<Point3<f64>> {
+    values.chunks_exact(3).map(Point3::from_slice).collect()
 }
 
 /// A pair of an official list.

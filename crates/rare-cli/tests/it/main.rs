@@ -6,6 +6,7 @@ mod commands;
 mod diffusion;
 mod eval;
 mod features;
+mod icp;
 mod options;
 mod outputs;
 #[path = "../../../rare-nets/tests/it/pickle_writer.rs"]

@@ -2,7 +2,8 @@
 
 use std::io::Write;
 
-use rare_nets::official::{is_fragment, read_fragment, read_pairs};
+use rare::nalgebra::Point3;
+use rare_nets::official::{is_fragment, read_fragment, read_network_dump, read_pairs};
 
 use crate::pickle_writer::Pickle;
 use crate::shared;
@@ -106,4 +107,54 @@ fn both_lists_of_pairs_are_read() {
     assert!(message.contains("pair 0"), "{message}");
     let message = read_pairs(file(Pickle(b"}".to_vec())).path()).unwrap_err().to_string();
     assert!(message.contains("no list of pairs"), "{message}");
+}
+
+#[test]
+fn dumps_of_cofinet_and_predator_become_correspondences() {
+    let points = [0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 2.0];
+    let moved: Vec<f64> = points.iter().map(|value| value + 0.5).collect();
+    let cofinet = Pickle(b"}(".to_vec())
+        .text("src_pcd")
+        .array(&[3, 3], &points)
+        .text("tgt_pcd")
+        .array(&[3, 3], &moved)
+        .text("correspondences")
+        .array(&[2, 2], &[0.0, 1.0, 2.0, 2.0])
+        .text("confidence")
+        .array(&[2], &[0.25, 0.75])
+        .raw(b"u");
+    let pairs = read_network_dump(file(cofinet).path()).unwrap();
+    assert_eq!(pairs.iter().map(|pair| pair.score).collect::<Vec<_>>(), [0.75, 0.25]);
+    assert_eq!(pairs[0].source, Point3::new(0.0, 1.0, 2.0));
+    assert_eq!(pairs[1].target, Point3::new(1.5, 0.5, 1.5));
+
+    // Three points of each cloud, the features of the target in another order.
+    let features = [1.0, 0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 1.0, 1.0, 0.0, -1.0, 0.0];
+    let predator = |count: u8| {
+        Pickle(b"}(".to_vec())
+            .text("pcd")
+            .array(&[6, 3], &[&points[..], &moved].concat())
+            .text("feats")
+            .array(&[6, 2], &features)
+            .text("overlaps")
+            .array(&[6], &[0.5; 6])
+            .text("saliency")
+            .array(&[6], &[0.1, 0.2, 0.3, 0.1, 0.2, 0.3])
+            .text("len_src")
+            .integer(count)
+            .raw(b"u")
+    };
+    let pairs = read_network_dump(file(predator(3)).path()).unwrap();
+    assert_eq!(pairs.len(), 3);
+    let of = |source: Point3<f64>| pairs.iter().find(|pair| pair.source == source).unwrap().target;
+    assert_eq!(of(Point3::new(0.0, 0.0, 1.0)), Point3::new(1.5, 0.5, 1.5));
+    assert_eq!(of(Point3::new(1.0, 0.0, 1.0)), Point3::new(0.5, 0.5, 1.5));
+
+    for (pickle, words) in [
+        (predator(9), "len_src"),
+        (Pickle(b"}(".to_vec()).text("pcd").integer(1).raw(b"u"), "no array pcd"),
+    ] {
+        let message = read_network_dump(file(pickle).path()).unwrap_err().to_string();
+        assert!(message.contains(words), "{message}");
+    }
 }

@@ -6,8 +6,10 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use rare::eval::dataset::{self, Dataset, StartPose};
 use rare::eval::trajectory;
-use rare::nalgebra::Matrix4;
-use rare::{Correspondence, InitialMethod};
+use rare::nalgebra::{Matrix4, Point3};
+use rare::pose::{PoseEstimator, Ransac};
+use rare::{Correspondence, InitialMethod, PointCloud};
+use rare_nets::official;
 use serde::Deserialize;
 use serde::de::IntoDeserializer;
 use serde::de::value::{Error as ValueError, StrDeserializer};
@@ -19,7 +21,7 @@ pub(super) enum Starts {
     Given(Vec<Matrix4<f64>>),
     /// Made for each pair.
     Estimated(InitialMethod),
-    /// What GeoTransformer's own run left of each pair, transform and correspondences.
+    /// What official runs left of each pair, correspondences and perhaps a transform.
     Dumped(Vec<PathBuf>),
 }
 
@@ -81,8 +83,16 @@ impl Starts {
 }
 
 impl Start {
-    /// Reads a dump and keeps so many of its correspondences, those with the highest scores.
-    pub(super) fn read(file: &Path, most: usize) -> rare::Result<Start> {
+    /// Reads a dump and keeps so many of its correspondences, those with the highest scores. Where it has no transform
+    /// (CoFiNet, Predator), RANSAC makes one of them, as those networks' own scripts do.
+    pub(super) fn read(file: &Path, most: usize, ransac: &Ransac) -> rare::Result<Start> {
+        if official::is_fragment(file) {
+            let mut correspondences = official::read_network_dump(file)?;
+            correspondences.truncate(most);
+            let point = PointCloud::new(vec![Point3::origin()])?;
+            let pose = ransac.estimate(&point, &point, &correspondences)?.target_from_source;
+            return Ok(Start { pose: pose.to_matrix(), correspondences: Some(correspondences) });
+        }
         let mut dump = rare::io::read_registration_dump(file)?;
         dump.correspondences.sort_by(|a, b| b.score.total_cmp(&a.score));
         dump.correspondences.truncate(most);
@@ -90,17 +100,19 @@ impl Start {
     }
 }
 
-/// The dumps of all pairs, `SCENE/REF_SRC.npz` or `SEQUENCE_SRC_REF.npz`, if they are there.
+/// The dumps of all pairs, if they are there: `SCENE/REF_SRC.npz` or `SEQUENCE_SRC_REF.npz` (GeoTransformer), or `N.pth` by
+/// the place in the list (CoFiNet, Predator).
 fn dumps(folder: &Path, dataset: &Dataset) -> Option<Vec<PathBuf>> {
-    let file = |pair: &dataset::DatasetPair| {
+    let file = |(index, pair): (usize, &dataset::DatasetPair)| {
         let (scene, source, reference) =
             (&pair.truth.scene, pair.truth.source, pair.truth.reference);
         let indoors = folder.join(scene).join(format!("{reference}_{source}.npz"));
         let sequence = scene.trim_start_matches('0');
         let outdoors = folder.join(format!("{sequence}_{source}_{reference}.npz"));
-        [indoors, outdoors].into_iter().find(|file| file.is_file())
+        let by_place = folder.join(format!("{index}.pth"));
+        [indoors, outdoors, by_place].into_iter().find(|file| file.is_file())
     };
-    dataset.pairs.iter().map(file).collect()
+    dataset.pairs.iter().enumerate().map(file).collect()
 }
 
 /// The logs of all scenes.

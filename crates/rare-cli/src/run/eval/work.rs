@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result};
 use rare::eval::dataset::DatasetPair;
 use rare::eval::results::{Estimate, ResultsFolder, rows_of};
+use rare::pose::Ransac;
 use rare::{Refiner, Scan};
 
 use super::Plan;
@@ -144,8 +145,12 @@ impl Loaded {
                 Ok(Start { pose, correspondences: None })
             }
             Starts::Dumped(files) => {
-                let most = if plan.dataset.protocol.is_outdoors() { 1000 } else { 500 };
-                Start::read(files.get(index).ok_or_else(missing)?, most)
+                let (most, ransac) = if plan.dataset.protocol.is_outdoors() {
+                    (1000, Ransac::kitti())
+                } else {
+                    (500, Ransac::three_d_match())
+                };
+                Start::read(files.get(index).ok_or_else(missing)?, most, &ransac)
             }
             Starts::Estimated(method) => {
                 let refiner = Refiner::new(plan.settings.refiner.clone());
