@@ -118,7 +118,8 @@ pub(crate) struct EvalArgs {
     /// Its folder
     #[arg(value_name = "ROOT")]
     pub(crate) root: PathBuf,
-    /// The initial transforms: a JSON file of the folder layout, a folder of scenes with est.log, or how they are
+    /// The initial transforms: a JSON file of the folder layout, an est.log, a folder of scenes
+    /// with est.log or with what official runs left, or how they are
     /// estimated (sc2-pcr, ransac, ...)
     #[arg(long, value_name = "FILE|DIR|METHOD", default_value = "sc2-pcr")]
     pub(crate) init: String,

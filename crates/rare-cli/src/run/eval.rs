@@ -17,7 +17,7 @@ use serde_json::json;
 use start::Starts;
 
 use crate::args::{DatasetKind, EvalArgs, Format};
-use crate::options::Settings;
+use crate::options::{Encoder, Settings};
 use crate::{SUCCESS, run, summary};
 
 /// Everything that is to be done.
@@ -31,10 +31,10 @@ struct Plan {
     jobs: usize,
 }
 
-pub(super) fn run(args: EvalArgs) -> Result<u8> {
+pub(super) fn run(args: &EvalArgs) -> Result<u8> {
     if args.dataset == DatasetKind::Paper {
-        let settings = args.options.clone().resolve()?;
-        return paper::run(&args, &settings);
+        let settings = resolve(args)?;
+        return paper::run(args, &settings);
     }
     let scoring = args.scoring.clone();
     let is_shard = args.shard.is_some();
@@ -56,9 +56,9 @@ pub(super) fn run(args: EvalArgs) -> Result<u8> {
 }
 
 impl Plan {
-    fn new(args: EvalArgs) -> Result<Plan> {
-        let dataset = read_dataset(&args)?;
-        let settings = args.options.resolve()?;
+    fn new(args: &EvalArgs) -> Result<Plan> {
+        let dataset = read_dataset(args)?;
+        let settings = resolve(args)?;
         let methods = Method::parse_all(&args.methods, &settings)?;
         let starts = Starts::read(&args.init, &args.root, &dataset)?;
         let (index, count) = args.shard.unwrap_or((0, 1));
@@ -79,6 +79,18 @@ impl Plan {
             pairs: self.dataset.pairs.iter().map(|pair| (&pair.truth).into()).collect(),
         })
     }
+}
+
+/// The settings of the refiner, whose features are the built-in ones.
+fn resolve(args: &EvalArgs) -> Result<Settings> {
+    let settings = args.options.clone().resolve()?;
+    if settings.encoder != Encoder::Builtin {
+        bail!(
+            "--encoder {}: evaluations are made with the built-in features; the example measure_refiner measures others",
+            settings.encoder.name()
+        );
+    }
+    Ok(settings)
 }
 
 fn read_dataset(args: &EvalArgs) -> Result<Dataset> {

@@ -38,7 +38,7 @@ pub(crate) fn run(cli: Cli) -> Result<u8> {
         Command::Convert(args) => convert::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Weights(args) => weights::run(args),
-        Command::Eval(args) => eval::run(args),
+        Command::Eval(args) => eval::run(&args),
         Command::Score(args) => score::run(&args),
         Command::Completions(args) => completions::run(&args),
     }

@@ -140,6 +140,25 @@ fn what_does_not_fit_is_refused() {
     let unknown =
         workplace.run(&["eval", "folder", "room", "--init", "nothing.json", "--out", "x"]);
     unknown.assert_refused(&["nothing.json"]);
+    eval(&["--out", "x", "--encoder", "diffusion"]).assert_refused(&["diffusion", "built-in"]);
+    // One scene's log serves as well.
+    let starts = workplace.json("room/init.json");
+    let block = |pair: &Value| {
+        let rows: Vec<String> = (pair["init"].as_array().unwrap().iter())
+            .map(|row| {
+                let numbers = row.as_array().unwrap().iter().map(Value::to_string);
+                numbers.collect::<Vec<_>>().join(" ")
+            })
+            .collect();
+        format!("0 {} 7\n{}\n", pair["src"], rows.join("\n"))
+    };
+    let log: String = starts["pairs"].as_array().unwrap().iter().map(block).collect();
+    workplace.write("est.log", log);
+    let by_log =
+        ["eval", "folder", "room", "--init", "est.log", "--methods", "init", "--out", "by_log"];
+    assert_eq!(workplace.run(&by_log).code, 0);
+    assert_eq!(eval(&["--out", "by_json"]).code, 0);
+    assert_equal_tables(&workplace, "by_log", "by_json");
     workplace.run(&["score", "nowhere"]).assert_refused(&["nowhere"]);
     workplace.write("results/results.jsonl", "{\"pair\":0}\n");
     workplace.run(&["score", "results"]).assert_refused(&["results.jsonl", "line 1"]);

@@ -191,12 +191,6 @@ impl ResultsFolder {
         whole.lines().enumerate().map(|(index, line)| self.parse(&path, index + 1, line)).collect()
     }
 
-    /// How long the results are, bytes: longer as soon as there is a new one.
-    #[must_use]
-    pub fn length(&self) -> u64 {
-        fs::metadata(self.results()).map_or(0, |metadata| metadata.len())
-    }
-
     fn parse(&self, path: &Path, line: usize, text: &str) -> Result<Estimate> {
         let estimate: Estimate = serde_json::from_str(text)
             .map_err(|cause| at(path, line, &format!("this is no result: {cause}")))?;

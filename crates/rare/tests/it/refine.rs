@@ -399,3 +399,29 @@ fn georeferenced_clouds_are_refined() {
     assert!(after.0 < before.0 / 3.0 && after.1 < before.1 / 3.0, "{after:?}");
     assert_eq!(refinement.scale.kind, SceneKind::Object);
 }
+
+#[test]
+fn parts_of_the_method_can_be_left_out() {
+    use rare::data::SetName;
+    use rare::pose::fit_weighted;
+    let pair = room();
+    let run = |recipe| {
+        let config = RefinerConfig { recipe, ..default() };
+        Refiner::new(config).refine(&pair.source, &pair.target, &pair.initial).unwrap()
+    };
+    let bare = Recipe { rounds: 1, polish: false, keep_initial: false, ..Recipe::default() };
+    let names = |refinement: &Refinement| -> Vec<SetName> {
+        refinement.sets.iter().map(|set| set.name).collect()
+    };
+    let without = run(Recipe { feature_transfer: false, ..bare.clone() });
+    let alone = [SetName::DiffusionReference, SetName::DiffusionSource, SetName::Features3d];
+    assert_eq!(names(&without), alone);
+    assert_eq!(names(&run(bare.clone())).len(), 5);
+    // Without aggregation: one fit over everything.
+    let fitted = run(Recipe { inlier_aggregation: false, ..bare });
+    let pairs = fitted.matches.union();
+    let one =
+        fit_weighted(pairs.iter().map(|pair| (pair.source, pair.target, pair.score))).unwrap();
+    let error = fitted.target_from_source.error_to(&one);
+    assert!(error.rotation_degrees < 1e-6 && error.translation < 1e-6, "{error:?}");
+}

@@ -38,7 +38,7 @@ struct Row {
 const LEARNED: Result<&str, &str> =
     Err("needs trained weights and a network that this version does not have");
 const LAYERS: Result<&str, &str> = Err(
-    "needs trained diffusion weights: run `rare eval ... --encoder diffusion --layers ...` where they are",
+    "needs trained diffusion weights, and is not automatic with them: `rare refine --encoder diffusion --layers 0,3` takes any layers",
 );
 
 const fn row(
@@ -213,13 +213,14 @@ impl Row {
         let features: PathBuf = args.root.join("features").join(self.start).join(benchmark);
         let starts = match Starts::read(&features.to_string_lossy(), &args.root, dataset) {
             Ok(starts) => starts,
-            Err(_) => {
+            Err(_) if !features.exists() => {
                 return Ok(Err(format!(
-                    "no results of {} in {}, as SCENE/REF_SRC.npz or SCENE/est.log for every pair",
+                    "no results of {} in {}, as SCENE/REF_SRC.npz, N.pth or SCENE/est.log for every pair",
                     self.start,
                     features.display()
                 )));
             }
+            Err(error) => return Ok(Err(format!("{error:#}"))),
         };
         if starts.lack_correspondences() && needs_correspondences(method) {
             return Ok(Err(format!(

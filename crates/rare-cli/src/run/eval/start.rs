@@ -54,6 +54,9 @@ impl Starts {
         }
         let poses = if path.is_dir() {
             read_logs(&path, dataset)?
+        } else if path.extension().is_some_and(|extension| extension == "log") {
+            // A log does not say of which scene it is.
+            read_log(&path, "")?
         } else {
             dataset::read_folder_starts(&path)?
         };
@@ -122,15 +125,19 @@ fn read_logs(folder: &Path, dataset: &Dataset) -> Result<Vec<StartPose>> {
         dataset.pairs.iter().map(|pair| pair.truth.scene.as_str()).collect();
     scenes.dedup();
     for scene in scenes {
-        let blocks = trajectory::read_log(folder.join(scene).join("est.log"))?;
-        poses.extend(blocks.into_iter().map(|block| StartPose {
-            scene: scene.to_owned(),
-            source: block.second,
-            reference: block.first,
-            target_from_source: block.matrix,
-        }));
+        poses.extend(read_log(&folder.join(scene).join("est.log"), scene)?);
     }
     Ok(poses)
+}
+
+fn read_log(path: &Path, scene: &str) -> Result<Vec<StartPose>> {
+    let start = |block: trajectory::Block<4>| StartPose {
+        scene: scene.to_owned(),
+        source: block.second,
+        reference: block.first,
+        target_from_source: block.matrix,
+    };
+    Ok(trajectory::read_log(path)?.into_iter().map(start).collect())
 }
 
 fn in_order(poses: &[StartPose], dataset: &Dataset, path: &Path) -> Result<Vec<Matrix4<f64>>> {
