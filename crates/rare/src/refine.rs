@@ -4,6 +4,7 @@ mod config;
 mod encoded_views;
 mod hypotheses;
 mod initial;
+mod search;
 mod stopwatch;
 mod views;
 mod working_pair;
@@ -27,7 +28,7 @@ use crate::encode::DepthEncoder;
 use crate::error::Result;
 use crate::scale::Scale;
 use crate::transfer::Sampling;
-use crate::verify::{DepthConsistency, Verdict, Verifier, confidence};
+use crate::verify::{Evidence, Model, Verdict, Verifier};
 
 /// Refines initial transforms between clouds.
 ///
@@ -56,7 +57,8 @@ pub struct Refinement {
     pub target_from_source: RigidTransform,
     /// What to make of it.
     pub verdict: Verdict,
-    /// How sure, 0 to 1. Not calibrated: use it to rank.
+    /// The calibrated probability that the transform is right: within 15 degrees and 6 voxels (0.3 m in rooms), streets
+    /// 5 degrees and 2 voxels (0.6 m).
     pub confidence: f64,
     /// Share of the source that lies on the target, 0 to 1.
     pub overlap: f64,
@@ -68,8 +70,10 @@ pub struct Refinement {
     pub sets: Vec<SetEvidence>,
     /// The correspondences themselves, each side in its cloud's frame as the caller gave it, metres.
     pub matches: CorrespondenceSets,
-    /// Two-way depth consistency of the clouds under the transform.
-    pub consistency: DepthConsistency,
+    /// Why: what sensors, surfaces and depth maps say of the transform.
+    pub evidence: Evidence,
+    /// The transforms that were compared, with what was known of each.
+    pub hypotheses: Vec<Hypothesis>,
     /// The 6 x 6 information matrix of 3DMatch's `gt.info` (translation first, metres) over the overlapping source
     /// points (one per voxel), moved into the target's local frame. Element (0, 0) is their number.
     pub information: Matrix6<f64>,
@@ -79,6 +83,17 @@ pub struct Refinement {
     pub timings: Vec<Timing>,
     /// What the caller should know, in words.
     pub warnings: Vec<String>,
+}
+
+/// A transform that was compared with others.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hypothesis {
+    /// Moves points of the source into the target's frame, both as the caller gave them.
+    pub target_from_source: RigidTransform,
+    /// What was known of it; without support if it was only screened.
+    pub evidence: Evidence,
+    /// Whether it descends from the initial transform, not from a search of its own.
+    pub from_initial: bool,
 }
 
 /// What one set of correspondences says of the final transform.
@@ -198,10 +213,11 @@ impl Refiner {
     /// As [`Refiner::refine`].
     pub fn initial_matches(&self, source: &Scan, target: &Scan) -> Result<Vec<Correspondence>> {
         let pair = WorkingPair::new(source, target, &self.config)?;
-        Ok(pair.to_world_pairs(&initial::matches(&pair, self.config.seed)?))
+        Ok(pair.to_world_pairs(&search::putative(&pair)?))
     }
 
-    /// Rounds of the paper's method, each from the pose of the one before.
+    /// Rounds of the paper's method from the initial transform; from what a search finds, unless that was enough; and
+    /// from the best until it settles. Then the polish.
     fn run(
         &self,
         pair: &WorkingPair<'_>,
@@ -210,21 +226,25 @@ impl Refiner {
         mut clock: Stopwatch<'_>,
     ) -> Result<Refinement> {
         let verifier = clock.time("verify", || self.verifier(pair, initial));
-        let mut best = Candidate::judged(*initial, &verifier);
-        let mut sets = CorrespondenceSets::default();
-        for _ in 0..self.config.recipe.rounds {
-            sets = self.correspondence_sets(pair, &best.target_from_source, given, &mut clock)?;
-            let next = self.next_candidate(pair, &sets, &best, &verifier, &mut clock);
-            let settled = next.settled(&best, pair.scale.voxel);
-            best = next;
+        let start = Candidate::judged(*initial, true, &verifier);
+        let round = Round { refiner: self, pair, given, verifier: &verifier };
+        let mut best = round.from(&start, &mut clock)?;
+        if self.config.recipe.search && !best.candidate.is_certain() {
+            best = round.from_search(best, initial, &mut clock)?;
+        }
+        for _ in 1..self.config.recipe.rounds {
+            let next = round.from(&best.candidate, &mut clock)?;
+            let settled = next.candidate.settled(&best.candidate, pair.scale.voxel);
+            best = best.then(next);
             if settled {
                 break;
             }
         }
         if self.config.recipe.polish {
-            best = clock.time("polish", || hypotheses::finish(pair, &best, &verifier));
+            best.candidate = clock
+                .time("polish", || hypotheses::finish(pair, &best.candidate, &best.sets, &verifier));
         }
-        let evidence = clock.time("verify", || self.evidence(pair, initial, &best, &sets));
+        let evidence = clock.time("verify", || self.evidence(pair, initial, &best));
         Ok(Refinement { timings: clock.into_timings(), ..evidence })
     }
 
@@ -253,39 +273,9 @@ impl Refiner {
         Ok(if recipe.feature_transfer { sets } else { sets.without_common_points() })
     }
 
-    /// Steps 8 and 9: the hypotheses of the sets, and the one that depth consistency prefers.
-    fn next_candidate(
-        &self,
-        pair: &WorkingPair<'_>,
-        sets: &CorrespondenceSets,
-        current: &Candidate,
-        verifier: &Verifier<'_>,
-        clock: &mut Stopwatch<'_>,
-    ) -> Candidate {
-        let recipe = &self.config.recipe;
-        // Sets that determine nothing propose nothing: then the current pose stands.
-        let proposed = clock
-            .time("aggregate", || hypotheses::propose(recipe, &pair.scale, sets))
-            .unwrap_or_default();
-        if !recipe.keep_initial {
-            let first = proposed.first().unwrap_or(&current.target_from_source);
-            return Candidate::judged(*first, verifier);
-        }
-        let ranked = clock
-            .time("verify", || hypotheses::rank(&proposed, current, verifier, pair.scale.voxel));
-        if !recipe.polish {
-            return ranked.into_iter().next().unwrap_or(*current);
-        }
-        clock.time("polish", || hypotheses::polish(pair, &ranked, verifier))
-    }
-
     fn verifier<'a>(&self, pair: &'a WorkingPair<'_>, pose: &RigidTransform) -> Verifier<'a> {
-        Verifier::new(
-            &pair.target.fine,
-            &pair.source.fine,
-            &self.viewpoints(pair, pose),
-            pair.scale.voxel,
-        )
+        let viewpoints = self.viewpoints(pair, pose);
+        Verifier::new(pair.target.judged(), pair.source.judged(), &viewpoints, pair.scale.voxel)
     }
 
     fn sampling(&self) -> Sampling {
@@ -301,37 +291,125 @@ impl Refiner {
         &self,
         pair: &WorkingPair<'_>,
         initial: &RigidTransform,
-        best: &Candidate,
-        sets: &CorrespondenceSets,
+        best: &Outcome,
     ) -> Refinement {
-        let pose = &best.target_from_source;
+        let Outcome { candidate, sets, compared } = best;
+        let pose = &candidate.target_from_source;
         let radius = pair.scale.acceptance_radius;
         let of_set = |set: &CorrespondenceSet| SetEvidence {
             name: set.name,
             correspondences: set.pairs.len(),
             inliers: vote(&set.pairs, &[*pose], radius)[0],
         };
+        let hypothesis = |candidate: &Candidate| Hypothesis {
+            target_from_source: pair.to_world(&candidate.target_from_source),
+            evidence: candidate.evidence,
+            from_initial: candidate.from_initial,
+        };
         let matches = pair.to_world_sets(sets);
         let sets: Vec<SetEvidence> = sets.sets.iter().map(of_set).collect();
         let overlap = pair.overlap(pose);
-        let inliers: usize = sets.iter().map(|set| set.inliers).sum();
-        let correspondences: usize = sets.iter().map(|set| set.correspondences).sum();
-        let inlier_ratio = inliers as f64 / correspondences.max(1) as f64;
-        let confidence = confidence(best.consistency.agreement(), overlap.share, inlier_ratio);
+        let confidence = Model::CONFIDENCE.probability(&candidate.evidence);
         Refinement {
             target_from_source: pair.to_world(pose),
             verdict: Verdict::of(confidence, pose == initial),
             confidence,
             overlap: overlap.share,
-            inliers,
-            correspondences,
+            inliers: sets.iter().map(|set| set.inliers).sum(),
+            correspondences: sets.iter().map(|set| set.correspondences).sum(),
             sets,
             matches,
-            consistency: best.consistency,
+            evidence: candidate.evidence,
+            hypotheses: compared.iter().map(hypothesis).collect(),
             information: overlap.information,
             scale: pair.scale.in_units(1.0 / pair.unit),
             timings: Vec::new(),
             warnings: pair.warnings(),
         }
+    }
+}
+
+impl Refinement {
+    /// The inputs of the confidence, with names.
+    #[must_use]
+    pub fn signals(&self) -> Vec<(&'static str, f64)> {
+        self.evidence.signals().to_vec()
+    }
+}
+
+/// What a round comes to.
+struct Outcome {
+    candidate: Candidate,
+    /// The correspondences that were seen from where the round began.
+    sets: CorrespondenceSets,
+    /// All that were compared on the way.
+    compared: Vec<Candidate>,
+}
+
+impl Outcome {
+    /// The other outcome, which follows this one.
+    fn then(self, next: Outcome) -> Outcome {
+        Outcome { compared: [self.compared, next.compared].concat(), ..next }
+    }
+}
+
+/// Steps 1 to 9 once, from any pose.
+struct Round<'a> {
+    refiner: &'a Refiner,
+    pair: &'a WorkingPair<'a>,
+    given: Option<&'a [Correspondence]>,
+    verifier: &'a Verifier<'a>,
+}
+
+impl Round<'_> {
+    /// The best of the starting pose and what the sets that are seen from it propose.
+    fn from(&self, start: &Candidate, clock: &mut Stopwatch<'_>) -> Result<Outcome> {
+        let (refiner, pair) = (self.refiner, self.pair);
+        let recipe = &refiner.config.recipe;
+        let pose = &start.target_from_source;
+        let sets = refiner.correspondence_sets(pair, pose, self.given, clock)?;
+        // Sets that determine nothing propose nothing: then the pose stands.
+        let proposed = clock
+            .time("aggregate", || hypotheses::propose(recipe, &pair.scale, &sets))
+            .unwrap_or_default();
+        let compared = if recipe.verify {
+            clock.time("verify", || {
+                hypotheses::ranked(pair, start, &proposed, &sets, recipe.polish, self.verifier)
+            })
+        } else {
+            let first = proposed.first().unwrap_or(pose);
+            vec![Candidate::judged(*first, true, self.verifier).supported(&sets, pair.scale.voxel)]
+        };
+        let candidate = *compared.first().unwrap_or(start);
+        Ok(Outcome { candidate, sets, compared })
+    }
+
+    /// Rounds from the most believable of the poses that a search finds, until one is certain.
+    fn from_search(
+        &self,
+        found: Outcome,
+        initial: &RigidTransform,
+        clock: &mut Stopwatch<'_>,
+    ) -> Result<Outcome> {
+        let (pair, seed) = (self.pair, self.refiner.config.seed);
+        let poses = clock.time("search", || search::by_features(pair, self.given, seed))?;
+        let around = search::around(pair, initial);
+        let starts = clock.time("verify", || {
+            hypotheses::screened(pair, &poses, &around, &found.candidate, self.verifier)
+        });
+        let mut best = found;
+        best.compared.extend(&starts);
+        for start in starts.iter().take(hypotheses::SCREENED) {
+            let next = self.from(start, clock)?;
+            if next.candidate.score() > best.candidate.score() {
+                best = best.then(next);
+            } else {
+                best.compared.extend(next.compared);
+            }
+            if best.candidate.is_certain() {
+                break;
+            }
+        }
+        Ok(best)
     }
 }

@@ -70,6 +70,12 @@ impl CorrespondenceSets {
         self.sets.iter().flat_map(|set| &set.pairs).copied().collect()
     }
 
+    /// The first set of a name, if there is one.
+    #[must_use]
+    pub fn of(&self, name: SetName) -> Option<&CorrespondenceSet> {
+        self.sets.iter().find(|set| set.name == name)
+    }
+
     /// The sets of either kind of feature alone.
     #[must_use]
     pub fn without_common_points(mut self) -> CorrespondenceSets {

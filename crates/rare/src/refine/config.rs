@@ -42,8 +42,11 @@ pub struct Recipe {
     pub inlier_aggregation: bool,
     /// Whether each set gives hypotheses by consensus (SC2-PCR) instead of one weighted fit over all its pairs.
     pub consensus: bool,
-    /// Whether the initial transform competes with the refined one, and the winner is chosen by depth consistency.
-    pub keep_initial: bool,
+    /// Whether the initial transform competes with what is proposed, and the most believable one wins.
+    pub verify: bool,
+    /// Whether, unless the initial transform leads to something certain, transforms are sought by 3D features and around
+    /// the initial one.
+    pub search: bool,
     /// Whether the result is polished by robust point-to-plane ICP, kept only if it verifies better.
     pub polish: bool,
     /// Times the weights are recomputed from the surviving inliers (`N_r` of section 3.3).
@@ -76,7 +79,8 @@ impl Default for Recipe {
             feature_transfer: true,
             inlier_aggregation: true,
             consensus: true,
-            keep_initial: true,
+            verify: true,
+            search: true,
             polish: true,
             reweighting_rounds: 5,
             top: 250,
@@ -97,7 +101,8 @@ impl Recipe {
             feature_transfer: true,
             inlier_aggregation: true,
             consensus: false,
-            keep_initial: false,
+            verify: false,
+            search: false,
             polish: false,
             reweighting_rounds: 5,
             top: 250,

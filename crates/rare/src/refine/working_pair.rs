@@ -12,22 +12,24 @@ use crate::data::{
     RigidTransform, Scan, voxel_downsample,
 };
 use crate::error::{Error, Result};
-use crate::features::{estimate_normals, fpfh_at, orient_towards};
+use crate::features::{Landmarks, estimate_normals};
 use crate::pose::IcpTarget;
 use crate::random::Random;
 use crate::refine::RefinerConfig;
 use crate::scale::{Scale, SceneKind};
-use crate::verify::{Overlap, overlap};
+use crate::verify::{JudgedCloud, Overlap, overlap};
 
 /// The voxel size in working units, for which the recipe's constants are made.
 const WORKING_VOXEL: f64 = 0.05;
+/// Voxel points that get a descriptor, at most.
+const LANDMARKS: usize = 5000;
+/// Sampling distance of the wide landmarks, voxels.
+const WIDE: f64 = 1.6;
 
 /// Two clouds ready to be registered; lengths in working units.
 pub(crate) struct WorkingPair<'a> {
     pub(crate) source: WorkingCloud<'a>,
     pub(crate) target: WorkingCloud<'a>,
-    /// The target's half-voxel points with normals and an index: what the polish aligns to.
-    pub(crate) target_surface: IcpTarget,
     /// All thresholds, working units.
     pub(crate) scale: Scale,
     /// Metres per working unit.
@@ -42,8 +44,10 @@ pub(crate) struct WorkingCloud<'a> {
     pub(crate) points: Cow<'a, [Point3<f64>]>,
     /// One point per voxel.
     pub(crate) coarse: Vec<Point3<f64>>,
-    /// One point per half voxel.
-    pub(crate) fine: Vec<Point3<f64>>,
+    /// One point per half voxel, with normals and an index.
+    pub(crate) surface: IcpTarget,
+    /// Voxel points with descriptors, at most 5000.
+    pub(crate) landmarks: Landmarks,
     /// 3D keypoints with features.
     pub(crate) keypoints: PointFeatures,
 }
@@ -73,7 +77,6 @@ impl<'a> WorkingPair<'a> {
         // The two sides take turns, not threads: each step inside is parallel already.
         let (source_side, target_side) = (prepare(source, 0)?, prepare(target, 1)?);
         Ok(WorkingPair {
-            target_surface: surface(&target_side.fine, &scale)?,
             source: source_side,
             target: target_side,
             scale,
@@ -129,7 +132,7 @@ impl<'a> WorkingPair<'a> {
 
     /// How much of the source lies on the target under a pose, in metres.
     pub(crate) fn overlap(&self, target_from_source: &RigidTransform) -> Overlap {
-        let tree = self.target_surface.tree();
+        let tree = self.target.surface.tree();
         overlap(tree, &self.source.coarse, target_from_source, self.scale.voxel, self.unit)
     }
 
@@ -159,24 +162,48 @@ impl<'a> WorkingCloud<'a> {
         let points = in_units(scan.cloud.points(), unit);
         let fine = voxel_downsample(&points, scale.voxel / 2.0)?;
         let coarse = voxel_downsample(&fine, scale.voxel)?;
-        let count = config.recipe.keypoints.unwrap_or(scale.keypoints);
         let mut random = Random::new(config.seed, stream);
+        let landmarks = landmarks(&coarse, scale.voxel, scale.kind, LANDMARKS, &mut random)?;
+        let count = config.recipe.keypoints.unwrap_or(scale.keypoints);
         let keypoints = match &scan.features {
             Some(features) => sampled(features, scan.cloud.shift(), unit, count, &mut random),
-            None => histograms(&coarse, scale, count, &mut random)?,
+            None => chosen(landmarks.features(), count, &mut random),
         };
-        Ok(WorkingCloud { points, coarse, fine, keypoints })
+        Ok(WorkingCloud { points, coarse, surface: surface(fine, scale)?, landmarks, keypoints })
     }
 
-    /// Fast point feature histograms at `count` seeded voxel points.
-    pub(crate) fn histograms(
-        &self,
-        scale: &Scale,
-        count: usize,
-        random: &mut Random,
-    ) -> Result<PointFeatures> {
-        histograms(&self.coarse, scale, count, random)
+    /// What the verification looks at.
+    pub(crate) fn judged(&self) -> JudgedCloud<'_> {
+        JudgedCloud {
+            points: &self.points,
+            surface: &self.surface,
+            landmarks: &self.landmarks,
+        }
     }
+
+    /// Landmarks of a coarser sampling, whose descriptors see twice as far.
+    ///
+    /// # Errors
+    /// `InvalidInput` if the cloud cannot be sampled so.
+    pub(crate) fn wide_landmarks(&self, scale: &Scale, random: &mut Random) -> Result<Landmarks> {
+        let voxel = WIDE * scale.voxel;
+        let points = voxel_downsample(&self.coarse, voxel)?;
+        landmarks(&points, voxel, scale.kind, LANDMARKS, random)
+    }
+}
+
+/// Landmarks at no more than `count` random points of a sampled cloud.
+fn landmarks(
+    points: &[Point3<f64>],
+    voxel: f64,
+    kind: SceneKind,
+    count: usize,
+    random: &mut Random,
+) -> Result<Landmarks> {
+    let mut indices = random.sample(count, points.len());
+    indices.sort_unstable();
+    let sensor = (kind != SceneKind::Object).then(Point3::origin);
+    Landmarks::describe(points, &indices, voxel, sensor.as_ref())
 }
 
 fn in_units(points: &[Point3<f64>], unit: f64) -> Cow<'_, [Point3<f64>]> {
@@ -188,9 +215,9 @@ fn in_units(points: &[Point3<f64>], unit: f64) -> Cow<'_, [Point3<f64>]> {
 }
 
 /// Normals from 20 neighbours within two voxels.
-fn surface(fine: &[Point3<f64>], scale: &Scale) -> Result<IcpTarget> {
-    let normals = estimate_normals(fine, &KdTree::new(fine), 2.0 * scale.voxel, 20);
-    IcpTarget::new(fine.to_vec(), normals)
+fn surface(fine: Vec<Point3<f64>>, scale: &Scale) -> Result<IcpTarget> {
+    let normals = estimate_normals(&fine, &KdTree::new(&fine), 2.0 * scale.voxel, 20);
+    IcpTarget::new(fine, normals)
 }
 
 /// The caller's keypoints in the working frame, at most `count` of them.
@@ -201,27 +228,14 @@ fn sampled(
     count: usize,
     random: &mut Random,
 ) -> PointFeatures {
-    let mut chosen = random.sample(count, features.len());
-    chosen.sort_unstable();
-    features.select(&chosen).normalised().map_points(|point| (point - shift) / unit)
+    chosen(features, count, random).normalised().map_points(|point| (point - shift) / unit)
 }
 
-/// Fast point feature histograms at `count` random voxel points: normals from 30 neighbours within 2 voxels, features
-/// from 100 neighbours within 5, as the official evaluations have it.
-fn histograms(
-    coarse: &[Point3<f64>],
-    scale: &Scale,
-    count: usize,
-    random: &mut Random,
-) -> Result<PointFeatures> {
-    let tree = KdTree::new(coarse);
-    let mut normals = estimate_normals(coarse, &tree, 2.0 * scale.voxel, 30);
-    if scale.kind != SceneKind::Object {
-        orient_towards(&mut normals, coarse, &Point3::origin());
-    }
-    let mut chosen = random.sample(count, coarse.len());
-    chosen.sort_unstable();
-    Ok(fpfh_at(coarse, &normals, &tree, 5.0 * scale.voxel, 100, &chosen)?.normalised())
+/// At most `count` random ones, in their order.
+fn chosen(features: &PointFeatures, count: usize, random: &mut Random) -> PointFeatures {
+    let mut indices = random.sample(count, features.len());
+    indices.sort_unstable();
+    features.select(&indices)
 }
 
 /// Three points that are not on one line are the least that determine a pose.

@@ -409,7 +409,7 @@ fn parts_of_the_method_can_be_left_out() {
         let config = RefinerConfig { recipe, ..default() };
         Refiner::new(config).refine(&pair.source, &pair.target, &pair.initial).unwrap()
     };
-    let bare = Recipe { rounds: 1, polish: false, keep_initial: false, ..Recipe::default() };
+    let bare = Recipe { rounds: 1, polish: false, verify: false, ..Recipe::default() };
     let names = |refinement: &Refinement| -> Vec<SetName> {
         refinement.sets.iter().map(|set| set.name).collect()
     };

@@ -202,7 +202,7 @@ impl Kind {
             "refine-one-round" => with(Recipe { rounds: 1, ..recipe }),
             "refine-no-polish" => with(Recipe { polish: false, ..recipe }),
             "refine-no-consensus" => with(Recipe { consensus: false, ..recipe }),
-            "refine-no-fallback" => with(Recipe { keep_initial: false, ..recipe }),
+            "refine-no-fallback" => with(Recipe { verify: false, ..recipe }),
             _ => bail!("--methods {name}: unknown, choose from {NAMES}"),
         })
     }
