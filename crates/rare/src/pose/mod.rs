@@ -8,6 +8,7 @@ mod icp_target;
 mod local_to_global;
 mod mac;
 mod normal_equations;
+mod partners;
 mod ransac;
 mod rigid_fit;
 mod robust_kernel;
