@@ -62,6 +62,20 @@ pub struct Icp {
     pub translation_tolerance: f64,
 }
 
+impl IcpStage {
+    /// # Errors
+    /// `InvalidInput` unless both lengths are positive.
+    pub(super) fn check(&self) -> Result<()> {
+        if self.max_distance > 0.0 && self.kernel_width > 0.0 {
+            return Ok(());
+        }
+        Err(Error::invalid(format!(
+            "an icp stage has the distance {} m and the kernel width {} m, both must be positive",
+            self.max_distance, self.kernel_width
+        )))
+    }
+}
+
 impl Icp {
     /// Point-to-plane for clouds sampled at `voxel` (metres): pairs up to three voxels apart, then two, then one and a
     /// half; Tukey kernels of the same widths; at most 30 rounds each.
@@ -157,7 +171,7 @@ impl Icp {
     ) -> Result<IcpResult> {
         let last = self.validated_last_stage(target)?;
         let mut run = Run::new(self, points, normals, target);
-        if run.finite == 0 {
+        if run.extent.finite == 0 {
             return Err(Error::invalid("icp was given no source points that are finite"));
         }
         let mut pose = *initial;
@@ -209,14 +223,7 @@ impl Icp {
                 "the overlap that icp trims to is {share}, it must be above 0 and at most 1"
             )));
         }
-        for stage in &self.stages {
-            if !(stage.max_distance > 0.0 && stage.kernel_width > 0.0) {
-                return Err(Error::invalid(format!(
-                    "an icp stage has the distance {} m and the kernel width {} m, both must be positive",
-                    stage.max_distance, stage.kernel_width
-                )));
-            }
-        }
+        self.stages.iter().try_for_each(IcpStage::check)?;
         self.stages.last().copied().ok_or_else(|| Error::invalid("icp was given no stages"))
     }
 }
@@ -240,7 +247,7 @@ fn evaluate(run: &mut Run<'_>, pose: RigidTransform, last: &IcpStage) -> Result<
     if !(own.is_finite() && surface.is_finite()) {
         return Err(Error::no_pose("the coordinates of the clouds are too large to be squared"));
     }
-    let count = run.finite as f64;
+    let count = run.extent.finite as f64;
     Ok(IcpResult {
         target_from_source: pose,
         fitness: fit.matched as f64 / count,

@@ -1,5 +1,6 @@
 //! Pose estimators: correspondences in, a rigid transform with evidence out.
 
+mod anchored_icp;
 mod consensus;
 mod consistency;
 mod fast_mac;
@@ -8,6 +9,7 @@ mod icp_target;
 mod local_to_global;
 mod mac;
 mod normal_equations;
+mod partners;
 mod ransac;
 mod rigid_fit;
 mod robust_kernel;
@@ -16,6 +18,7 @@ mod sc2_pcr_plus_plus;
 mod significance;
 mod spectral;
 
+pub use anchored_icp::{AnchoredIcp, AnchoredIcpResult};
 pub use consistency::{CompatibilityGraph, Consistency};
 pub use fast_mac::FastMac;
 pub use icp::{Icp, IcpMethod, IcpResult, IcpStage, MultiScaleIcp, OpenDirection, Trim};

@@ -72,6 +72,9 @@ impl Step {
 }
 
 impl Symmetric3 {
+    pub(super) const IDENTITY: Symmetric3 =
+        Symmetric3 { xx: 1.0, xy: 0.0, xz: 0.0, yy: 1.0, yz: 0.0, zz: 1.0 };
+
     /// The matrix times a vector.
     pub(super) fn times(&self, v: &Vector3<f64>) -> Vector3<f64> {
         Vector3::new(

@@ -69,8 +69,8 @@ impl IcpMethod {
     ) {
         match self {
             IcpMethod::PointToPoint => {
-                let one = Symmetric3 { xx: 1.0, xy: 0.0, xz: 0.0, yy: 1.0, yz: 0.0, zz: 1.0 };
-                add_difference(sums, &pair.moved, &pair.target, &one, kernel, width);
+                let metric = Symmetric3::IDENTITY;
+                add_difference(sums, &pair.moved, &pair.target, &metric, kernel, width);
             }
             IcpMethod::PointToPlane => {
                 let normal = pair.target_normal;
