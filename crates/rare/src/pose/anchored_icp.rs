@@ -9,7 +9,7 @@
 mod held;
 mod surfaces;
 
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -36,8 +36,8 @@ pub struct AnchoredIcp {
     pub rotation_tolerance: f64,
     /// ... and moves the centroid of the pairs by less than this, metres.
     pub translation_tolerance: f64,
-    /// Weight of all anchors together relative to that of all surface pairs together; 0 ignores the anchors. Beside it
-    /// a direction that no surface shows is held by the anchors alone.
+    /// Weight of all anchors together relative to that of all surface pairs together; 0 ignores the anchors. However
+    /// small it is, a direction that no surface shows is held by the anchors alone.
     pub anchor_weight: f64,
     /// Width of the anchors' Tukey kernel, metres: anchors that are further off have no say.
     pub anchor_width: f64,
@@ -104,17 +104,7 @@ impl AnchoredIcp {
             iterations.push(rounds);
         }
         let pairs = surfaces.pairs(&pose, &last);
-        let Some(sums) = surface_sums(&pairs) else {
-            return Err(Error::no_pose(format!(
-                "no sampled point lies within {} m of a point of the other cloud with a normal less than 60 degrees off",
-                last.max_distance.min(last.kernel_width)
-            )));
-        };
-        if !(sums.is_finite() && sums.spread.is_finite()) {
-            return Err(Error::no_pose(
-                "the coordinates of the clouds are too large to be squared",
-            ));
-        }
+        ensure_support(&pairs, &last)?;
         let anchors = self.held(anchors, &pose).map_or(0, |held| held.len());
         let pairs = pairs.len();
         Ok(AnchoredIcpResult { target_from_source: pose, pairs, anchors, iterations, converged })
@@ -169,26 +159,19 @@ impl AnchoredIcp {
     }
 
     fn validated_last_stage(&self) -> Result<IcpStage> {
-        for (what, value) in
-            [("rotation", self.rotation_tolerance), ("translation", self.translation_tolerance)]
-        {
-            if value.is_nan() || value < 0.0 {
+        let (turn, shift) = (self.rotation_tolerance, self.translation_tolerance);
+        let (weight, width) = (self.anchor_weight, self.anchor_width);
+        for (what, value, makes_sense) in [
+            ("rotation tolerance", turn, turn >= 0.0),
+            ("translation tolerance", shift, shift >= 0.0),
+            ("anchor weight", weight, (0.0..f64::INFINITY).contains(&weight)),
+            ("anchor width", width, width > 0.0),
+        ] {
+            if !makes_sense {
                 return Err(Error::invalid(format!(
-                    "the {what} tolerance of anchored icp is {value}, it must be at least 0"
+                    "the {what} of anchored icp is {value}: the width must be positive, the weight finite and at least 0, the tolerances at least 0"
                 )));
             }
-        }
-        if !(self.anchor_weight >= 0.0 && self.anchor_weight.is_finite()) {
-            return Err(Error::invalid(format!(
-                "the anchor weight of anchored icp is {}, it must be finite and at least 0",
-                self.anchor_weight
-            )));
-        }
-        if self.anchor_width.is_nan() || self.anchor_width <= 0.0 {
-            return Err(Error::invalid(format!(
-                "the anchor width of anchored icp is {} m, it must be positive",
-                self.anchor_width
-            )));
         }
         self.stages.iter().try_for_each(IcpStage::check)?;
         self.stages
@@ -198,12 +181,26 @@ impl AnchoredIcp {
     }
 }
 
+/// # Errors
+/// `NoPose` if there is no pair or a sum over them overflows.
+fn ensure_support(pairs: &[SurfacePair], last: &IcpStage) -> Result<()> {
+    let Some(sums) = surface_sums(pairs) else {
+        return Err(Error::no_pose(format!(
+            "no sampled point lies within {} m of a point of the other cloud with a normal less than 60 degrees off",
+            last.max_distance.min(last.kernel_width)
+        )));
+    };
+    if !(sums.is_finite() && sums.spread.is_finite()) {
+        return Err(Error::no_pose("the coordinates of the clouds are too large to be squared"));
+    }
+    Ok(())
+}
+
 /// Sums up what the pairs say, linearised about their weighted centroid, chunk by chunk in fixed order; `None` if there
 /// is no pair.
 fn surface_sums(pairs: &[SurfacePair]) -> Option<NormalEquations> {
     let weight: f64 = pairs.iter().map(|pair| pair.weight).sum();
-    let moment: nalgebra::Vector3<f64> =
-        pairs.iter().map(|pair| pair.point.coords * pair.weight).sum();
+    let moment: Vector3<f64> = pairs.iter().map(|pair| pair.point.coords * pair.weight).sum();
     if weight <= 0.0 {
         return None;
     }

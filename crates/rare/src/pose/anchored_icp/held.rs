@@ -6,7 +6,8 @@ use crate::data::{Correspondence, RigidTransform};
 use crate::pose::RobustKernel;
 use crate::pose::normal_equations::{NormalEquations, Symmetric3};
 
-/// Anchors whose weights sum up to less than this are chance as likely as not: they are ignored.
+/// Anchors whose weights sum up to less than this are ignored: so few may agree by chance, and would have the same say
+/// as many.
 const LEAST_WEIGHT: f64 = 5.0;
 
 /// The anchors that have a say at one pose.
