@@ -15,6 +15,7 @@ pub use config::{Recipe, RefinerConfig};
 use encoded_views::DenseViews;
 pub use encoded_views::EncodedViews;
 use hypotheses::Candidate;
+use search::Effort;
 pub use initial::InitialMethod;
 use stopwatch::Stopwatch;
 pub use stopwatch::Timing;
@@ -230,7 +231,7 @@ impl Refiner {
         let round = Round { refiner: self, pair, given, verifier: &verifier };
         let mut best = round.from(&start, &mut clock)?;
         if self.config.recipe.search && !best.candidate.is_certain() {
-            best = round.from_search(best, initial, &mut clock)?;
+            best = round.from_searches(best, initial, &mut clock)?;
         }
         for _ in 1..self.config.recipe.rounds {
             let next = round.from(&best.candidate, &mut clock)?;
@@ -374,7 +375,7 @@ impl Round<'_> {
             .unwrap_or_default();
         let compared = if recipe.verify {
             clock.time("verify", || {
-                hypotheses::ranked(pair, start, &proposed, &sets, recipe.polish, self.verifier)
+                hypotheses::ranked(pair, start, &proposed, &sets, self.verifier)
             })
         } else {
             let first = proposed.first().unwrap_or(pose);
@@ -384,21 +385,40 @@ impl Round<'_> {
         Ok(Outcome { candidate, sets, compared })
     }
 
-    /// Rounds from the most believable of the poses that a search finds, until one is certain.
-    fn from_search(
+    /// Rounds from the most believable of the poses that searches find, until one is certain: first those of the usual
+    /// descriptors and around the initial transform, then those of others.
+    fn from_searches(
         &self,
-        found: Outcome,
+        mut best: Outcome,
         initial: &RigidTransform,
         clock: &mut Stopwatch<'_>,
     ) -> Result<Outcome> {
         let (pair, seed) = (self.pair, self.refiner.config.seed);
-        let poses = clock.time("search", || search::by_features(pair, self.given, seed))?;
-        let around = search::around(pair, initial);
-        let starts = clock.time("verify", || {
-            hypotheses::screened(pair, &poses, &around, &found.candidate, self.verifier)
-        });
-        let mut best = found;
-        best.compared.extend(&starts);
+        for effort in [Effort::Usual, Effort::Thorough] {
+            let found = clock.time("search", || search::by_features(pair, self.given, effort))?;
+            let around = match effort {
+                Effort::Usual => search::around(pair, initial, seed),
+                Effort::Thorough => Vec::new(),
+            };
+            let starts = clock.time("verify", || {
+                hypotheses::screened(pair, &found, &around, &best.candidate, self.verifier)
+            });
+            best = self.from_best(best, &starts, clock)?;
+            if best.candidate.is_certain() {
+                break;
+            }
+        }
+        Ok(best)
+    }
+
+    /// Rounds from the first few starts, until one is certain; the best outcome.
+    fn from_best(
+        &self,
+        mut best: Outcome,
+        starts: &[Candidate],
+        clock: &mut Stopwatch<'_>,
+    ) -> Result<Outcome> {
+        best.compared.extend(starts);
         for start in starts.iter().take(hypotheses::SCREENED) {
             let next = self.from(start, clock)?;
             if next.candidate.score() > best.candidate.score() {

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use crate::aggregate::{Aggregation, aggregate, aggregate_candidates};
 use crate::data::{Correspondence, CorrespondenceSets, RigidTransform, SetName};
 use crate::error::Result;
-use crate::pose::{Icp, IcpStage, RobustKernel, Sc2Pcr, fit_weighted};
+use crate::pose::{AnchoredIcp, Icp, IcpStage, IcpTarget, RobustKernel, Sc2Pcr, fit_weighted};
 use crate::refine::Recipe;
 use crate::refine::working_pair::WorkingPair;
 use crate::scale::Scale;
@@ -23,14 +23,21 @@ pub(super) struct Candidate {
 
 /// Candidates of a search from which a round begins.
 pub(super) const SCREENED: usize = 3;
-/// Candidates of a round that are polished.
-const POLISHED: usize = 3;
 /// Hypotheses taken from each set.
 const HYPOTHESES_PER_SET: usize = 2;
 /// Most pairs of a set in which consensus is sought; the best-scored ones.
 const MOST_PAIRS: usize = 1000;
 /// Points that are moved onto the surface when many candidates are polished.
 const ROUGH_POINTS: usize = 700;
+/// Points of each surface in the final alignment.
+const FINE_POINTS: usize = 5000;
+/// Weight of all matches in the final alignment, relative to that of all surface pairs, where everything overlaps. The
+/// less does, the less of the surfaces' disagreement is noise that averages out.
+const ANCHOR_WEIGHT: f64 = 0.04;
+/// An overlap below this counts as this.
+const LEAST_OVERLAP: f64 = 0.08;
+/// Log-odds that the final alignment may cost: less than what noise makes of the evidence.
+const TOLERATED: f64 = 0.3;
 /// What descends from the initial transform is believed more by these log-odds: whoever brings a transform has reasons
 /// for it.
 const PRIOR_OF_INITIAL: f64 = 1.0;
@@ -154,14 +161,13 @@ fn alike(a: &RigidTransform, b: &RigidTransform, voxel: f64) -> bool {
     difference.rotation_degrees < 1.0 && difference.translation < 0.5 * voxel
 }
 
-/// The current candidate, the proposed poses and the best few of them moved onto the surface, the most believable first;
-/// all judged by the surfaces, the sensors and the sets.
+/// The current candidate and the proposed poses, the most believable first; all judged by the surfaces, the sensors and
+/// the sets.
 pub(super) fn ranked(
     pair: &WorkingPair<'_>,
     current: &Candidate,
     proposed: &[RigidTransform],
     sets: &CorrespondenceSets,
-    polish: bool,
     verifier: &Verifier<'_>,
 ) -> Vec<Candidate> {
     let voxel = pair.scale.voxel;
@@ -170,14 +176,7 @@ pub(super) fn ranked(
     };
     let mut candidates = vec![current.supported(sets, voxel)];
     candidates.extend(distinct(proposed, voxel).into_iter().map(judge));
-    let mut ranked = rank(candidates, voxel);
-    if polish {
-        let starts: Vec<RigidTransform> =
-            ranked.iter().take(POLISHED).map(|candidate| candidate.target_from_source).collect();
-        ranked.extend(moved_onto_surface(pair, &starts).into_iter().map(judge));
-        ranked = rank(ranked, voxel);
-    }
-    ranked
+    rank(candidates, voxel)
 }
 
 /// The most believable of many poses, after a rough alignment, that differ from the current one: those found by features
@@ -217,22 +216,39 @@ pub(super) fn moved_onto_surface(
     starts.par_iter().filter_map(align).collect()
 }
 
-/// The winner moved onto the surface with half-voxel points, every second of them; kept unless it verifies worse.
+/// The winner moved onto the surfaces, held by the matches of the depth maps where the surfaces slide; kept unless it
+/// verifies worse.
 pub(super) fn finish(
     pair: &WorkingPair<'_>,
     best: &Candidate,
     sets: &CorrespondenceSets,
     verifier: &Verifier<'_>,
 ) -> Candidate {
-    let icp = schedule(pair.scale.voxel, &[1.0], 0.01);
-    let points = pair.source.surface.points();
-    let source: Vec<Point3<f64>> = points.iter().step_by(2).copied().collect();
-    let Ok(aligned) = icp.align(&source, &pair.target.surface, &best.target_from_source) else {
+    let contact = &best.evidence.contact;
+    let overlap = contact.source_share.min(contact.reference_share).max(LEAST_OVERLAP);
+    let icp = AnchoredIcp {
+        anchor_weight: ANCHOR_WEIGHT / overlap,
+        ..AnchoredIcp::for_voxel(pair.scale.voxel)
+    };
+    let views = [SetName::DiffusionReference, SetName::DiffusionSource];
+    let anchors: Vec<Correspondence> =
+        views.iter().filter_map(|&name| sets.of(name)).flat_map(|set| &set.pairs).copied().collect();
+    let (source, target) = (&pair.source.surface, &pair.target.surface);
+    let start = &best.target_from_source;
+    let Ok(aligned) =
+        icp.align(source, target, &sample(source), &sample(target), &anchors, start)
+    else {
         return *best;
     };
     let finished = Candidate::judged(aligned.target_from_source, best.from_initial, verifier)
         .supported(sets, pair.scale.voxel);
-    if finished.score() >= best.score() { finished } else { *best }
+    if finished.score() >= best.score() - TOLERATED { finished } else { *best }
+}
+
+/// Evenly spread points of a surface.
+fn sample(surface: &IcpTarget) -> Vec<usize> {
+    let count = surface.points().len();
+    (0..count).step_by(count.div_ceil(FINE_POINTS).max(1)).collect()
 }
 
 /// Tukey point-to-plane within a few voxels, coarse to fine, until steps are shorter than `tolerance` voxels.

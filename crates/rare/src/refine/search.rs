@@ -7,50 +7,100 @@ use crate::error::Result;
 use crate::matching::{correspondences, nearest};
 use crate::pose::Sc2Pcr;
 use crate::random::Random;
-use crate::refine::working_pair::WorkingPair;
+use crate::refine::working_pair::{WorkingCloud, WorkingPair};
 
 /// Matches in which consensus is sought.
 const MATCHES: usize = 3000;
-/// Matches of either scale in the search over both.
-const MATCHES_OF_EACH_SCALE: usize = 2500;
+/// Matches in which consensus is sought over all kinds of descriptors.
+const MATCHES_OF_ALL: usize = 5000;
 /// Distinct hypotheses taken from each set of matches.
 const HYPOTHESES: usize = 20;
-/// Turn and shift (voxels) of the restarts around a transform: about half of what local refinement recovers from.
-const RESTART_TURN: f64 = 0.21;
-const RESTART_SHIFT: f64 = 6.0;
+/// Restarts around a transform, ...
+const RESTARTS: usize = 32;
+/// ... which turn (radians about each axis) and shift (voxels along each axis) by at most this: what coarse alignments
+/// are usually off by.
+const RESTART_TURN: f64 = 0.25;
+const RESTART_SHIFT: f64 = 8.0;
 
-/// What consensus among matches of 3D features proposes: descriptors of two reaches, and both together, because where
-/// little is shared each finds what the other misses. Working frames; may be empty.
+/// How much is spent on a search.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Effort {
+    /// Descriptors of two reaches.
+    Usual,
+    /// Descriptors of other reaches and of finer sampling, for what the usual ones do not find.
+    Thorough,
+}
+
+/// Descriptors of one kind: sampling distance and reach, both voxels.
+#[derive(Debug, Clone, Copy)]
+struct Kind {
+    sampling: f64,
+    reach: f64,
+    /// Neighbours that are described, at most.
+    neighbours: usize,
+}
+
+const WIDE: Kind = Kind { sampling: 1.6, reach: 14.0, neighbours: 300 };
+const THOROUGH: [Kind; 3] = [
+    Kind { sampling: 1.0, reach: 7.0, neighbours: 200 },
+    Kind { sampling: 0.6, reach: 2.5, neighbours: 100 },
+    Kind { sampling: 0.6, reach: 4.0, neighbours: 150 },
+];
+
+/// What consensus among matches of 3D features proposes. Where little is shared, descriptors of different reaches find
+/// what the others miss, and all together what none finds alone. Working frames; may be empty.
+///
+/// # Errors
+/// `InvalidInput` if a cloud cannot be sampled as the descriptors need it.
 pub(super) fn by_features(
     pair: &WorkingPair<'_>,
     given: Option<&[Correspondence]>,
-    seed: u64,
+    effort: Effort,
 ) -> Result<Vec<RigidTransform>> {
-    let near = putative(pair)?;
-    let wide = wide_putative(pair, seed)?;
-    let of_each = |pairs: &[Correspondence]| pairs[..pairs.len().min(MATCHES_OF_EACH_SCALE)].to_vec();
-    let both = [of_each(&near), of_each(&wide)].concat();
-    let given = given.unwrap_or_default().to_vec();
+    let sets = match effort {
+        Effort::Usual => {
+            let mut sets = vec![putative(pair)?, putative_of(pair, WIDE)?];
+            sets.push(joined(&sets));
+            sets.extend(given.map(<[Correspondence]>::to_vec));
+            sets
+        }
+        Effort::Thorough => {
+            let of_kind = |&kind: &Kind| putative_of(pair, kind);
+            let mut sets = THOROUGH.iter().map(of_kind).collect::<Result<Vec<_>>>()?;
+            sets.push(joined(&sets));
+            sets
+        }
+    };
     let estimator = Sc2Pcr::for_voxel(pair.scale.voxel);
+    // Matches without consensus have nothing to say.
     let hypotheses = |pairs: &Vec<Correspondence>| {
-        // Matches without consensus have nothing to say.
         estimator.hypotheses(pairs, HYPOTHESES).unwrap_or_default()
     };
-    let found = [near, wide, both, given].iter().flat_map(hypotheses).collect::<Vec<_>>();
-    Ok(found.into_iter().map(|estimate| estimate.target_from_source).collect())
+    let found = sets.iter().flat_map(hypotheses);
+    Ok(found.map(|estimate| estimate.target_from_source).collect())
+}
+
+/// The best-scored matches of all sets, as many of each.
+fn joined(sets: &[Vec<Correspondence>]) -> Vec<Correspondence> {
+    let share = MATCHES_OF_ALL / sets.len().max(1);
+    sets.iter().flat_map(|pairs| pairs.iter().take(share)).copied().collect()
 }
 
 /// For every source landmark its nearest target landmark in feature space; the best-scored ones. Matches are not
 /// required to be mutual: at low overlap that costs more right ones than it removes wrong ones.
+///
+/// # Errors
+/// As [`nearest`].
 pub(super) fn putative(pair: &WorkingPair<'_>) -> Result<Vec<Correspondence>> {
     best_matches(pair.source.landmarks.features(), pair.target.landmarks.features())
 }
 
-/// The same for descriptors that see twice as far.
-fn wide_putative(pair: &WorkingPair<'_>, seed: u64) -> Result<Vec<Correspondence>> {
-    let source = pair.source.wide_landmarks(&pair.scale, &mut Random::new(seed, 2))?;
-    let target = pair.target.wide_landmarks(&pair.scale, &mut Random::new(seed, 3))?;
-    best_matches(source.features(), target.features())
+/// The same for descriptors of another kind.
+fn putative_of(pair: &WorkingPair<'_>, kind: Kind) -> Result<Vec<Correspondence>> {
+    let describe = |cloud: &WorkingCloud<'_>| {
+        cloud.described(&pair.scale, kind.sampling, kind.reach, kind.neighbours)
+    };
+    best_matches(&describe(&pair.source)?, &describe(&pair.target)?)
 }
 
 fn best_matches(source: &PointFeatures, target: &PointFeatures) -> Result<Vec<Correspondence>> {
@@ -60,21 +110,22 @@ fn best_matches(source: &PointFeatures, target: &PointFeatures) -> Result<Vec<Co
     Ok(pairs)
 }
 
-/// Restarts around a transform: turned either way about each axis through the middle of the source, and shifted along
-/// it. Working frames.
-pub(super) fn around(pair: &WorkingPair<'_>, pose: &RigidTransform) -> Vec<RigidTransform> {
+/// Restarts around a transform: turned about random axes through the middle of the source, and shifted in random
+/// directions. Working frames.
+pub(super) fn around(
+    pair: &WorkingPair<'_>,
+    pose: &RigidTransform,
+    seed: u64,
+) -> Vec<RigidTransform> {
     let points = &pair.source.coarse;
     let sum: Vector3<f64> = points.iter().map(|point| point.coords).sum();
     let middle = pose.apply(&Point3::from(sum / points.len().max(1) as f64)).coords;
-    let shift = RESTART_SHIFT * pair.scale.voxel;
-    let mut restarts = Vec::with_capacity(12);
-    for axis in [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()] {
-        for sign in [1.0, -1.0] {
-            let turn = Rotation3::from_axis_angle(&axis, sign * RESTART_TURN);
-            let about_middle = RigidTransform::new(turn, middle - turn * middle);
-            restarts.push(about_middle * *pose);
-            restarts.push(RigidTransform::from_translation(*axis * (sign * shift)) * *pose);
-        }
-    }
-    restarts
+    let mut random = Random::new(seed, 4);
+    let mut inside_unit_cube = || Vector3::from_fn(|_, _| 2.0 * random.uniform() - 1.0);
+    let mut restart = |_| {
+        let turn = Rotation3::new(RESTART_TURN * inside_unit_cube());
+        let shift = RESTART_SHIFT * pair.scale.voxel * inside_unit_cube();
+        RigidTransform::new(turn, middle + shift - turn * middle) * *pose
+    };
+    (0..RESTARTS).map(&mut restart).collect()
 }

@@ -12,7 +12,7 @@ use crate::data::{
     RigidTransform, Scan, voxel_downsample,
 };
 use crate::error::{Error, Result};
-use crate::features::{Landmarks, estimate_normals};
+use crate::features::{Landmarks, estimate_normals, fpfh_at, orient_towards};
 use crate::pose::IcpTarget;
 use crate::random::Random;
 use crate::refine::RefinerConfig;
@@ -23,8 +23,8 @@ use crate::verify::{JudgedCloud, Overlap, overlap};
 const WORKING_VOXEL: f64 = 0.05;
 /// Voxel points that get a descriptor, at most.
 const LANDMARKS: usize = 5000;
-/// Sampling distance of the wide landmarks, voxels.
-const WIDE: f64 = 1.6;
+/// Normals are taken over no less than twice this, voxels: over less they show noise.
+const FINEST_NORMALS: f64 = 0.75;
 
 /// Two clouds ready to be registered; lengths in working units.
 pub(crate) struct WorkingPair<'a> {
@@ -181,14 +181,30 @@ impl<'a> WorkingCloud<'a> {
         }
     }
 
-    /// Landmarks of a coarser sampling, whose descriptors see twice as far.
+    /// Fast point feature histograms of the cloud sampled at `sampling` voxels, over at most `neighbours` points within
+    /// `reach` voxels; of no more than 5000 points, evenly chosen.
     ///
     /// # Errors
     /// `InvalidInput` if the cloud cannot be sampled so.
-    pub(crate) fn wide_landmarks(&self, scale: &Scale, random: &mut Random) -> Result<Landmarks> {
-        let voxel = WIDE * scale.voxel;
-        let points = voxel_downsample(&self.coarse, voxel)?;
-        landmarks(&points, voxel, scale.kind, LANDMARKS, random)
+    pub(crate) fn described(
+        &self,
+        scale: &Scale,
+        sampling: f64,
+        reach: f64,
+        neighbours: usize,
+    ) -> Result<PointFeatures> {
+        let dense = if sampling < 1.0 { self.surface.points() } else { &self.coarse };
+        let points = voxel_downsample(dense, sampling * scale.voxel)?;
+        let tree = KdTree::new(&points);
+        let radius = 2.0 * sampling.max(FINEST_NORMALS) * scale.voxel;
+        let mut normals = estimate_normals(&points, &tree, radius, 30);
+        if scale.kind != SceneKind::Object {
+            orient_towards(&mut normals, &points, &Point3::origin());
+        }
+        let step = points.len().div_ceil(LANDMARKS).max(1);
+        let chosen: Vec<usize> = (0..points.len()).step_by(step).collect();
+        let reach = reach * scale.voxel;
+        Ok(fpfh_at(&points, &normals, &tree, reach, neighbours, &chosen)?.normalised())
     }
 }
 

@@ -32,7 +32,7 @@ impl Verdict {
 }
 
 /// Numbers that the models weigh.
-const SIGNALS: usize = 9;
+const SIGNALS: usize = 8;
 
 impl Evidence {
     /// The evidence as the models weigh it, with names. Counts enter by their logarithms: a thousand agreeing points
@@ -45,12 +45,11 @@ impl Evidence {
         [
             ("agreement", consistency.agreement()),
             ("occlusion", consistency.occlusion()),
-            ("log_agreeing", logarithm(consistency.agree)),
-            ("log_gross_violations", logarithm(consistency.gross_violation)),
-            ("residual", contact.residual),
+            ("gross_violations", consistency.gross_share()),
             ("normal_agreement", contact.normal_agreement),
             // In standard deviations of what pairs without anything in common would give.
             ("correlation", contact.correlation * (contact.compared as f64).sqrt()),
+            ("log_looseness", contact.looseness.ln_1p()),
             ("support", support.inliers as f64 / support.matches.max(1) as f64),
             ("log_weaker_support", logarithm(support.weaker_inliers)),
         ]
@@ -71,14 +70,14 @@ pub struct Model {
 impl Model {
     /// For evidence without support, with which many hypotheses are compared.
     pub const SCREENING: Model = Model {
-        intercept: -0.1,
-        coefficients: [15.9, -7.4, -1.85, -0.07, -7.7, 0.0, 0.59, 0.0, 0.0],
+        intercept: -5.0,
+        coefficients: [6.0, -6.6, -12.0, 2.0, 0.3, 0.0, 0.0, 0.0],
     };
 
     /// For evidence with support: the confidence that is reported.
     pub const CONFIDENCE: Model = Model {
-        intercept: -2.0,
-        coefficients: [14.0, -6.0, -1.6, -0.07, -6.0, 0.0, 0.45, 5.0, 0.4],
+        intercept: -4.0,
+        coefficients: [5.0, -5.8, -12.0, 1.5, 0.35, 0.0, 4.2, 0.1],
     };
 
     /// The log-odds that a pose with this evidence is right.

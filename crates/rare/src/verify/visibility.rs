@@ -49,6 +49,12 @@ impl DepthConsistency {
         share(self.occluded, self.agree + self.violation + self.occluded)
     }
 
+    /// Share of the comparable points (agreeing or violating) that violate grossly; 0 where there is none.
+    #[must_use]
+    pub fn gross_share(&self) -> f64 {
+        share(self.gross_violation, self.agree + self.violation)
+    }
+
     fn add(self, other: DepthConsistency) -> DepthConsistency {
         DepthConsistency {
             agree: self.agree + other.agree,
