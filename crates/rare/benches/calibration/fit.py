@@ -2,7 +2,7 @@
 """Fit the model of the confidence to results of `rare eval folder`, and say how good it is on data it has not seen.
 
     rare eval folder DATA --pairs pairs.json --init init_NAME.json --methods refine --out RESULTS/DATA.pairs.NAME
-    fit.py RESULTS... [--success 'objects*=5,0.06'] [--hold-out] [--plot reliability.svg]
+    fit.py RESULTS... [--success 'objects*=15,0.025'] [--hold-out] [--plot reliability.svg]
     fit.py --as-reported RESULTS... HARNESS.json...
 
 A folder of results is read with all folders below it. The model is `confidence = 1 / (1 + exp(-(intercept + sum
@@ -15,7 +15,10 @@ With --as-reported nothing is fitted: the confidences in the files are scored, a
 harness. Needs numpy.
 """
 import argparse
+import json
 import sys
+import tempfile
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -75,10 +78,13 @@ def fit(rows, names, penalty):
     rows = [row for row in rows if has_signals(row)]
     if not rows:
         raise SystemExit("nothing is left to fit when a folder is left out: add results of other folders")
+    right = np.array([row.right for row in rows])
+    if right.all() or not right.any():
+        raise SystemExit(f"all {len(rows)} results to be fitted are {'right' if right.all() else 'wrong'}: add others")
     keys = [row.key for row in rows]
-    count = {key: keys.count(key) for key in set(keys)}
+    count = Counter(keys)
     weights = np.array([1 / count[key] for key in keys])
-    return logistic.fit(values_of(rows, names), np.array([row.right for row in rows]), weights, penalty)
+    return logistic.fit(values_of(rows, names), right, weights, penalty)
 
 
 def predict(model, rows, names):
@@ -214,12 +220,13 @@ def check_figures():
     assert abs(reliability.calibration_error(confidence, right) - (0.05 + 0.85 + 0.2 + 0.1) / 5) < 1e-12
     figures = reliability.Figures.of(confidence, right, 0.5)
     assert (figures.accepted, figures.failures) == (2, 1)
+    assert reliability.Figures.of(confidence, right, 0.9).failures == 0
     low, high = scoring.wilson(1, 10)
     assert abs(low - 0.0179) < 1e-4 and abs(high - 0.4042) < 1e-4, (low, high)
     assert scoring.wilson(0, 0) == (0.0, 1.0) and scoring.wilson(0, 10)[0] == 0.0
-    turned = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 0], [0, 0, 0, 1]])
+    turned = np.array([[0.75**0.5, -0.5, 0, 3], [0.5, 0.75**0.5, 0, 4], [0, 0, 1, 0], [0, 0, 0, 1]])
     degrees, metres = scoring.errors(turned, np.eye(4))
-    assert abs(degrees - 90) < 1e-9 and abs(metres - 5) < 1e-12
+    assert abs(degrees - 30) < 1e-9 and abs(metres - 5) < 1e-12
     assert scoring.errors(2 * turned, np.eye(4)) == (180.0, float("inf"))
     success = scoring.Success(["objects*=3,0.02"])
     assert success.limits("objects-a") == (3.0, 0.02) and success.limits("lidar-dev") == (5.0, 0.6)
@@ -243,7 +250,30 @@ def check_split():
     assert not np.allclose(parts["frag50"], predict(fit(rows, names, 1.0), unseen, names), atol=1e-6)
 
 
+def check_reading():
+    """Results of every kind: right, wrong, without a pose, of another method, half a line; and a file of the harness."""
+    pose = lambda metres: [[1, 0, 0, metres], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]  # noqa: E731
+    pairs = [{"source": number, "reference": 0, "target_from_source": pose(1.0)} for number in (5, 6, 7)]
+    found = [{"pair": 2, "method": "refine", "target_from_source": pose(1.4), "confidence": 0.7, "signals": {"x": 1}},
+             {"pair": 0, "method": "refine", "target_from_source": None, "confidence": None},
+             {"pair": 1, "method": "gicp", "target_from_source": pose(1.0), "confidence": None}]
+    with tempfile.TemporaryDirectory() as name:
+        results, harness = Path(name) / "a" / "results.jsonl", Path(name) / "harness.json"
+        results.parent.mkdir()
+        (results.parent / "benchmark.json").write_text(json.dumps({"name": "street-1", "pairs": pairs}))
+        results.write_text("".join(json.dumps(line) + "\n" for line in found) + '{"pair": 1, "me')
+        rows = [{"src": 6, "ref": 0, "re": 1.0, "te": 0.4, "confidence": 0.9}, {"src": 7, "ref": 0, "re": 180, "te": None}]
+        harness.write_text(json.dumps({"bench": "some/frag50", "detail": {"rare": rows, "p2l": []}}))
+        read = read_all([name, harness], None, scoring.Success())
+    # 0.4 m is right outdoors and wrong indoors.
+    assert [(row.key, row.position, row.right, row.confidence) for row in read] == [
+        (("street-1", 7, 0), 2, True, 0.7), (("street-1", 5, 0), 0, False, None),
+        (("frag50", 6, 0), 0, False, 0.9), (("frag50", 7, 0), 1, False, None)], read
+    assert [row.signals for row in read] == [{"x": 1}, None, None, None]
+
+
 def self_check():
+    check_reading()
     check_fit()
     check_figures()
     check_split()

@@ -31,9 +31,9 @@ def read_all(paths, method, success):
     """The rows of files and of all folders of results at or below the paths, in a fixed order."""
     rows = []
     for path in map(Path, paths):
-        files = [path] if path.is_file() else sorted(path.rglob("results.jsonl"))
+        files = [path] if path.is_file() else sorted(path.rglob("results.jsonl")) or sorted(path.rglob("*.json"))
         if not files:
-            raise SystemExit(f"{path}: no results.jsonl here or below")
+            raise SystemExit(f"{path}: no results.jsonl and no file of the accuracy harness here or below")
         for file in files:
             read = read_results if file.name == "results.jsonl" else read_harness
             rows += read(file, method, success)

@@ -2,6 +2,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -49,15 +50,15 @@ def auc(confidence, right):
 
 
 def bins(confidence, right):
-    """(mean confidence, right results, results) of every bin of equal width that is not empty."""
+    """(number, mean confidence, right results, results) of every bin of equal width that is not empty."""
     index = np.minimum((confidence * BINS).astype(int), BINS - 1)
-    members = [index == number for number in range(BINS)]
-    return [(float(confidence[m].mean()), int(right[m].sum()), int(m.sum())) for m in members if m.any()]
+    members = [(number, index == number) for number in range(BINS)]
+    return [(number, float(confidence[m].mean()), int(right[m].sum()), int(m.sum())) for number, m in members if m.any()]
 
 
 def calibration_error(confidence, right):
     """The mean over all results of how far the confidence of their bin is from its share of right results."""
-    return sum(abs(mean * count - good) for mean, good, count in bins(confidence, right)) / len(right)
+    return sum(abs(mean * count - good) for _, mean, good, count in bins(confidence, right)) / len(right)
 
 
 def plot(confidence, right, title):
@@ -74,16 +75,15 @@ def plot(confidence, right, title):
         lines += [text(x(value), 468, f"{value:.1f}", middle), text(62, y(value) + 4, f"{value:.1f}", end)]
     lines.append(f'<path d="M{x(0)} {y(0)}L{x(1)} {y(1)}" stroke="#999" stroke-dasharray="5 4"/>')
     found = bins(confidence, right)
-    points = " ".join(f"{x(mean):.1f},{y(good / count):.1f}" for mean, good, count in found)
+    points = " ".join(f"{x(mean):.1f},{y(good / count):.1f}" for _, mean, good, count in found)
     lines.append(f'<polyline points="{points}" fill="none" stroke="#9bc0e6"/>')
-    for mean, good, count in found:
+    for number, mean, good, count in found:
         low, high = scoring.wilson(good, count)
         lines.append(f'<path d="M{x(mean):.1f} {y(low):.1f}V{y(high):.1f}" stroke="#1f6fb4"/>')
         lines.append(f'<circle cx="{x(mean):.1f}" cy="{y(good / count):.1f}" r="4" fill="#1f6fb4"/>')
-        # Beside the point, on the side where the plot goes on.
-        left = mean > 0.5
-        lines.append(text(x(mean) + (-8 if left else 8), y(good / count) + (14 if left else -6), count,
-                          end if left else ""))
-    lines += [text(270, 30, title, f'{middle} font-size="14"'), text(270, 495, "confidence", middle),
+        # Above the bin, where no line runs.
+        lines.append(text(x((number + 0.5) / BINS), 44, count, middle))
+    lines += [text(270, 22, escape(title), f'{middle} font-size="14"'), text(270, 495, "confidence", middle),
+              text(62, 44, "results", end),
               text(20, 250, "share of right results", f'{middle} transform="rotate(-90 20 250)"'), "</svg>"]
     return "\n".join(lines) + "\n"
