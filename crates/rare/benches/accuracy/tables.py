@@ -183,10 +183,11 @@ def made_up(method_errors, pairs="pairs.json"):
 
 
 def self_check():
-    group = made_up({START: [(1, 0.1), (2, 0.1), (90, None)], "p2l": [(1, 0.1), (40, 0.1), (90, 2)],
-                     "gicp": [(2, 0.2), (40, 0.1), (3, 0.1)], OURS: [(2, 0.1), (20, 0.4), (1, 0.2)]})
+    group = made_up({START: [(1, 0.1), (2, 0.1), (90, None), (90, 2)], "p2l": [(1, 0.1), (40, 0.1), (90, 2), (90, 2)],
+                     "gicp": [(2, 0.2), (40, 0.1), (3, 0.1), (90, 2)],
+                     OURS: [(2, 0.1), (20, 0.4), (1, 0.2), (1, 0.05)]})
     row = overview_row(group)
-    assert row == ["frag50 | pairs | kiss", "3", "2", "2 (gicp)", "2", "1.50 / 15.00", "1", "1", "2.00", "2.90"], row
+    assert row == ["frag50 | pairs | kiss", "4", "2", "2 (gicp)", "3", "1.33 / 11.67", "1", "1", "2.50", "3.85"], row
     assert ratios(*(scores_of(group.results[name]) for name in (OURS, "p2l"))) == (2.0, 1.0, 1)
     degrees, metres, count = ratios(*(scores_of(group.results[name]) for name in (OURS, "gicp")))
     assert abs(degrees - 3 / 5) < 1e-12 and abs(metres - 1.0) < 1e-12 and count == 2
