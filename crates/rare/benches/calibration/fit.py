@@ -262,7 +262,7 @@ def check_reading():
         results.parent.mkdir()
         (results.parent / "benchmark.json").write_text(json.dumps({"name": "street-1", "pairs": pairs}))
         results.write_text("".join(json.dumps(line) + "\n" for line in found) + '{"pair": 1, "me')
-        rows = [{"src": 6, "ref": 0, "re": 1.0, "te": 0.4, "confidence": 0.9}, {"src": 7, "ref": 0, "re": 180, "te": None}]
+        rows = [{"src": 6, "ref": 0, "re": 1.0, "te": 0.4, "confidence": 0.9}, {"src": 7, "ref": 0, "re": 1.0, "te": None}]
         harness.write_text(json.dumps({"bench": "some/frag50", "detail": {"rare": rows, "p2l": []}}))
         read = read_all([name, harness], None, scoring.Success())
     # 0.4 m is right outdoors and wrong indoors.
