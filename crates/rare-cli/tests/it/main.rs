@@ -2,6 +2,8 @@
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking")]
 
 mod bad_input;
+#[path = "../../../rare/examples/synthetic_benchmark/benchmark.rs"]
+mod benchmark;
 mod commands;
 mod diffusion;
 mod eval;
@@ -14,6 +16,7 @@ mod pickle_writer;
 mod readme;
 mod registration;
 mod shared;
+mod synthetic_benchmark;
 #[cfg(feature = "fetch")]
 mod weights;
 #[cfg(feature = "fetch")]

@@ -94,6 +94,10 @@ pub struct Estimate {
     pub error: Option<String>,
     /// How sure the method is, 0 to 1, if it says so.
     pub confidence: Option<f64>,
+    /// The finite numbers by name from which the confidence was computed, if the method tells them: with them the model
+    /// of the confidence can be fitted anew without another run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub signals: Option<BTreeMap<String, f64>>,
     /// Its verdict, if it has one.
     pub verdict: Option<String>,
     /// Wall time.
@@ -322,4 +326,57 @@ pub fn merge(folders: &[ResultsFolder]) -> Result<Vec<MethodResult>> {
         .collect();
     results.sort_by_key(|result| result.name != "init");
     Ok(results)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn benchmark() -> Benchmark {
+        let pair = TruePair {
+            scene: "room".to_owned(),
+            source: 1,
+            reference: 0,
+            target_from_source: Matrix4::identity(),
+            information: None,
+            overlap: None,
+            is_first_of_scene: true,
+        };
+        Benchmark {
+            name: "room".to_owned(),
+            protocol: Protocol::Plain,
+            settings: serde_json::Value::Null,
+            pairs: vec![(&pair).into()],
+        }
+    }
+
+    fn estimate(method: &str, signals: Option<BTreeMap<String, f64>>) -> Estimate {
+        Estimate {
+            pair: 0,
+            method: method.to_owned(),
+            target_from_source: Some(rows_of(&Matrix4::identity())),
+            error: None,
+            confidence: Some(0.75),
+            signals,
+            verdict: Some("refined".to_owned()),
+            seconds: 0.5,
+        }
+    }
+
+    #[test]
+    fn signals_are_read_back_exactly_and_may_be_missing() {
+        let folder = tempfile::tempdir().unwrap();
+        let results = ResultsFolder::begin(folder.path(), benchmark()).unwrap();
+        let signals = [("agreement", 0.1 + 0.2), ("log_overlap", -1.0 / 3.0)];
+        let signals = signals.map(|(name, value)| (name.to_owned(), value)).into();
+        let written = [estimate("refine", Some(signals)), estimate("gicp", None)];
+        for estimate in &written {
+            results.append(estimate).unwrap();
+        }
+        assert_eq!(results.estimates().unwrap(), written);
+        // Results of methods that tell none stay as small as they were, and older folders can be read.
+        let text = fs::read_to_string(folder.path().join("results.jsonl")).unwrap();
+        let mentions: Vec<bool> = text.lines().map(|line| line.contains("signals")).collect();
+        assert_eq!(mentions, [true, false]);
+    }
 }

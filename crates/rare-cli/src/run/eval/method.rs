@@ -1,12 +1,15 @@
 //! What can be compared: the names of `--methods` and what they do to a pair.
 
+use std::collections::BTreeMap;
+
 use anyhow::{Result, bail};
 use rare::nalgebra::Matrix4;
 use rare::pose::{FastMac, IcpMethod, Mac, MultiScaleIcp, PoseEstimator, Ransac, Sc2Pcr};
 use rare::scale::{Profile, Scale};
 use rare::verify::Verdict;
 use rare::{
-    Correspondence, InitialMethod, PointCloud, Recipe, Refiner, RefinerConfig, RigidTransform, Scan,
+    Correspondence, InitialMethod, PointCloud, Recipe, Refinement, Refiner, RefinerConfig,
+    RigidTransform, Scan,
 };
 
 use super::start::Start;
@@ -44,6 +47,8 @@ enum Estimator {
 pub(super) struct Found {
     pub(super) target_from_source: Matrix4<f64>,
     pub(super) confidence: Option<f64>,
+    /// What the confidence was computed from.
+    pub(super) signals: Option<BTreeMap<String, f64>>,
     pub(super) verdict: Option<String>,
 }
 
@@ -79,7 +84,8 @@ impl Method {
         let initial = &start.pose;
         match &self.kind {
             Kind::Init => {
-                Ok(Found { target_from_source: *initial, confidence: None, verdict: None })
+                let target_from_source = *initial;
+                Ok(Found { target_from_source, confidence: None, signals: None, verdict: None })
             }
             Kind::Icp(method, voxel) => {
                 let initial = RigidTransform::from_matrix(initial)?;
@@ -96,11 +102,7 @@ impl Method {
                     Some(pairs) => refiner.refine_matched(source, reference, &initial, pairs)?,
                     None => refiner.refine(source, reference, &initial)?,
                 };
-                Ok(Found {
-                    target_from_source: refinement.target_from_source.to_matrix(),
-                    confidence: Some(refinement.confidence),
-                    verdict: Some(verdict_name(refinement.verdict).to_owned()),
-                })
+                Ok(Found::refined(&refinement))
             }
         }
     }
@@ -155,8 +157,23 @@ impl Estimator {
 impl Found {
     /// A method that only gives a transform.
     fn without_verdict(pose: &RigidTransform) -> Found {
-        Found { target_from_source: pose.to_matrix(), confidence: None, verdict: None }
+        let target_from_source = pose.to_matrix();
+        Found { target_from_source, confidence: None, signals: None, verdict: None }
     }
+
+    fn refined(refinement: &Refinement) -> Found {
+        Found {
+            target_from_source: refinement.target_from_source.to_matrix(),
+            confidence: Some(refinement.confidence),
+            signals: signals(refinement),
+            verdict: Some(verdict_name(refinement.verdict).to_owned()),
+        }
+    }
+}
+
+/// What the confidence of a refinement was computed from.
+fn signals(_: &Refinement) -> Option<BTreeMap<String, f64>> {
+    None
 }
 
 fn align(

@@ -169,12 +169,13 @@ impl Loaded {
         let seconds = clock.elapsed().as_secs_f64();
         let method = method.name.clone();
         match found {
-            Ok(Found { target_from_source, confidence, verdict }) => Estimate {
+            Ok(Found { target_from_source, confidence, signals, verdict }) => Estimate {
                 pair,
                 method,
                 target_from_source: Some(rows_of(&target_from_source)),
                 error: None,
                 confidence,
+                signals,
                 verdict,
                 seconds,
             },
@@ -184,6 +185,7 @@ impl Loaded {
                 target_from_source: None,
                 error: Some(error.to_string()),
                 confidence: None,
+                signals: None,
                 verdict: None,
                 seconds,
             },

@@ -1,0 +1,63 @@
+"""Ridge logistic regression by Newton's method."""
+from dataclasses import dataclass
+
+import numpy as np
+
+ROUNDS = 200
+TOLERANCE = 1e-10
+
+
+@dataclass
+class Model:
+    """The logarithm of the odds of being right is `intercept + signals @ coefficients`, on raw signals."""
+
+    intercept: float
+    coefficients: np.ndarray
+
+    def probability(self, signals):
+        return logistic(self.intercept + signals @ self.coefficients)
+
+
+def logistic(odds):
+    return 1 / (1 + np.exp(-np.clip(odds, -700, 700)))
+
+
+def fit(signals, right, weights, penalty):
+    """Minimises `sum(weights * log loss) + penalty / 2 * |coefficients of standardised signals|^2`; the intercept is free.
+
+    `signals` is N x D, `right` and `weights` have N entries. A signal that never varies gets the coefficient 0.
+    """
+    mean = weights @ signals / weights.sum()
+    spread = np.sqrt(weights @ (signals - mean) ** 2 / weights.sum())
+    spread[spread <= 1e-12 * (1 + np.abs(mean))] = np.inf
+    design = np.column_stack([np.ones(len(right)), (signals - mean) / spread])
+    ridge = np.full(design.shape[1], float(penalty))
+    # The intercept is free, but must not run away where all rows are right.
+    ridge[0] = 1e-9
+    ridge[1:][np.isinf(spread)] = 1.0
+    standard = newton(design, right.astype(float), weights, ridge)
+    coefficients = standard[1:] / spread
+    return Model(float(standard[0] - coefficients @ mean), coefficients)
+
+
+def newton(design, right, weights, ridge):
+    """The minimum of a strictly convex loss: steps are halved until they lower it."""
+    beta = np.zeros(design.shape[1])
+    current = loss(design, right, weights, ridge, beta)
+    for _ in range(ROUNDS):
+        share = logistic(design @ beta)
+        gradient = design.T @ (weights * (share - right)) + ridge * beta
+        curvature = (design.T * (weights * share * (1 - share))) @ design + np.diag(ridge)
+        step = np.linalg.solve(curvature, gradient)
+        if np.abs(step).max() <= TOLERANCE * (1 + np.abs(beta).max()):
+            return beta - step
+        size = 1.0
+        while (lower := loss(design, right, weights, ridge, beta - size * step)) > current and size > 1e-6:
+            size /= 2
+        beta, current = beta - size * step, lower
+    raise SystemExit("the fit does not converge: the signals separate right from wrong, raise --penalty")
+
+
+def loss(design, right, weights, ridge, beta):
+    odds = design @ beta
+    return weights @ (np.logaddexp(0, odds) - right * odds) + ridge @ beta**2 / 2
