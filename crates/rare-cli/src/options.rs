@@ -56,6 +56,15 @@ pub(crate) struct Options {
     /// --preset paper or --encoder recorded: 1]
     #[arg(long, value_name = "N")]
     pub(crate) rounds: Option<usize>,
+    /// Take the first proposal as it is: nothing is compared with the initial transform, nothing is sought elsewhere
+    #[arg(long, num_args = 0, default_missing_value = "true")]
+    pub(crate) no_verify: Option<bool>,
+    /// Do not look for transforms elsewhere when the initial one leads to nothing certain
+    #[arg(long, num_args = 0, default_missing_value = "true")]
+    pub(crate) no_search: Option<bool>,
+    /// Do not align the surfaces at the end
+    #[arg(long, num_args = 0, default_missing_value = "true")]
+    pub(crate) no_polish: Option<bool>,
     /// A flag of `register` alone; here so that one file serves both commands.
     #[arg(skip)]
     pub(crate) init_method: Option<InitialMethod>,
@@ -198,6 +207,9 @@ impl Options {
             encoder: self.encoder.or(other.encoder),
             depth_features: self.depth_features.or(other.depth_features),
             rounds: self.rounds.or(other.rounds),
+            no_verify: self.no_verify.or(other.no_verify),
+            no_search: self.no_search.or(other.no_search),
+            no_polish: self.no_polish.or(other.no_polish),
             init_method: self.init_method.or(other.init_method),
             seed: self.seed.or(other.seed),
             threads: self.threads.or(other.threads),
@@ -229,8 +241,8 @@ impl Options {
         let recipe = if paper { Recipe::paper() } else { Recipe::default() };
         let recipe = match encoder {
             Encoder::Builtin => recipe,
-            // The features belong to the views under the initial transform, a second round has others.
-            Encoder::Recorded => Recipe { rounds: 1, ..recipe },
+            // The features belong to the views under the initial transform; other rounds and transforms have others.
+            Encoder::Recorded => Recipe { rounds: 1, search: false, ..recipe },
             Encoder::Diffusion => recipe.for_network(),
         };
         Ok(RefinerConfig {
@@ -238,8 +250,21 @@ impl Options {
             camera: self.camera.unwrap_or_default(),
             voxel: self.voxel,
             seed: self.seed.unwrap_or(0),
-            recipe: Recipe { rounds: self.rounds(encoder, recipe.rounds)?, ..recipe },
+            recipe: self
+                .without_steps(Recipe { rounds: self.rounds(encoder, recipe.rounds)?, ..recipe }),
         })
+    }
+
+    /// The recipe without the steps that are switched off. A search is worth nothing where nothing is compared.
+    fn without_steps(&self, recipe: Recipe) -> Recipe {
+        let kept = |off: Option<bool>| !off.unwrap_or(false);
+        let verify = recipe.verify && kept(self.no_verify);
+        Recipe {
+            verify,
+            search: recipe.search && verify && kept(self.no_search),
+            polish: recipe.polish && kept(self.no_polish),
+            ..recipe
+        }
     }
 
     fn rounds(&self, encoder: Encoder, default: usize) -> Result<usize> {

@@ -3,9 +3,9 @@
 use anyhow::Result;
 use rare::data::SetName;
 use rare::nalgebra::Matrix4;
-use rare::refine::Timing;
+use rare::refine::{Hypothesis, Timing};
 use rare::scale::{Profile, Scale, SceneKind};
-use rare::verify::Verdict;
+use rare::verify::{Evidence, Model, Verdict};
 use rare::viewpoints::CameraChoice;
 use rare::{Recipe, RigidTransform};
 use serde::{Serialize, Serializer};
@@ -24,10 +24,13 @@ struct Record<'a> {
     initial: Option<Matrix<4>>,
     verdict: Verdict,
     confidence: f64,
+    signals: Signals<'a>,
+    evidence: &'a Evidence,
     overlap: f64,
     inliers: usize,
     correspondences: usize,
     sets: Vec<Set>,
+    hypotheses: Vec<HypothesisRecord>,
     information: Matrix<6>,
     timings_s: Timings<'a>,
     config: Config<'a>,
@@ -76,6 +79,36 @@ struct Features {
     version: &'static str,
 }
 
+/// A transform that was compared with others; the probability is that of the model that fits what was known.
+#[derive(Serialize)]
+struct HypothesisRecord {
+    target_from_source: Matrix<4>,
+    from_initial: bool,
+    probability: f64,
+    evidence: Evidence,
+}
+
+impl From<&Hypothesis> for HypothesisRecord {
+    fn from(hypothesis: &Hypothesis) -> HypothesisRecord {
+        HypothesisRecord {
+            target_from_source: rows(&hypothesis.target_from_source),
+            from_initial: hypothesis.from_initial,
+            probability: Model::for_evidence(&hypothesis.evidence)
+                .probability(&hypothesis.evidence),
+            evidence: hypothesis.evidence,
+        }
+    }
+}
+
+/// The inputs of the confidence, by name.
+struct Signals<'a>(&'a Evidence);
+
+impl Serialize for Signals<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.signals())
+    }
+}
+
 /// Seconds by step, in the order of the steps.
 struct Timings<'a> {
     read: f64,
@@ -106,10 +139,13 @@ pub(crate) fn to_json(registration: &Registration) -> Result<String> {
         initial: registration.initial.as_ref().map(rows),
         verdict: registration.verdict(),
         confidence: refinement.confidence,
+        signals: Signals(&refinement.evidence),
+        evidence: &refinement.evidence,
         overlap: refinement.overlap,
         inliers: refinement.inliers,
         correspondences: refinement.correspondences,
         sets: sets.collect(),
+        hypotheses: refinement.hypotheses.iter().map(HypothesisRecord::from).collect(),
         information: matrix(|row, column| information[(row, column)]),
         timings_s: Timings {
             read: registration.read_seconds,

@@ -233,9 +233,9 @@ impl Totals {
 fn line(before: &PoseError, after: &PoseError, solved: bool, result: &Refinement) -> String {
     let error =
         |error: &PoseError| format!("{:6.2} {:6.3}", error.rotation_degrees, error.translation);
-    let consistency = &result.consistency;
+    let consistency = &result.evidence.consistency;
     format!(
-        "{} -> {} {} {:9} conf {:.2} ov {:.2} inl {}/{} agree {} occ {} viol {} seen {} truth",
+        "{} -> {} {} {:9} conf {:.2} ov {:.2} inl {}/{} agree {} occ {} viol {} gross {} truth",
         error(before),
         error(after),
         if solved { "ok " } else { "BAD" },
@@ -247,6 +247,6 @@ fn line(before: &PoseError, after: &PoseError, solved: bool, result: &Refinement
         consistency.agree,
         consistency.occluded,
         consistency.violation,
-        consistency.seen
+        consistency.gross_violation
     )
 }

@@ -15,8 +15,8 @@ pub use config::{Recipe, RefinerConfig};
 use encoded_views::DenseViews;
 pub use encoded_views::EncodedViews;
 use hypotheses::Candidate;
-use search::Effort;
 pub use initial::InitialMethod;
+use search::Effort;
 use stopwatch::Stopwatch;
 pub use stopwatch::Timing;
 use working_pair::WorkingPair;
@@ -217,8 +217,8 @@ impl Refiner {
         Ok(pair.to_world_pairs(&search::putative(&pair)?))
     }
 
-    /// Rounds of the paper's method from the initial transform; from what a search finds, unless that was enough; and
-    /// from the best until it settles. Then the polish.
+    /// Rounds of the paper's method from the initial transform until it settles; unless that was enough, from what
+    /// searches find. Then the polish.
     fn run(
         &self,
         pair: &WorkingPair<'_>,
@@ -230,20 +230,15 @@ impl Refiner {
         let start = Candidate::judged(*initial, true, &verifier);
         let round = Round { refiner: self, pair, given, verifier: &verifier };
         let mut best = round.from(&start, &mut clock)?;
+        best = round.until_settled(best, &mut clock)?;
         if self.config.recipe.search && !best.candidate.is_certain() {
             best = round.from_searches(best, initial, &mut clock)?;
-        }
-        for _ in 1..self.config.recipe.rounds {
-            let next = round.from(&best.candidate, &mut clock)?;
-            let settled = next.candidate.settled(&best.candidate, pair.scale.voxel);
-            best = best.then(next);
-            if settled {
-                break;
-            }
+            best = round.until_settled(best, &mut clock)?;
         }
         if self.config.recipe.polish {
-            best.candidate = clock
-                .time("polish", || hypotheses::finish(pair, &best.candidate, &best.sets, &verifier));
+            best.candidate = clock.time("polish", || {
+                hypotheses::finish(pair, &best.candidate, &best.sets, &verifier)
+            });
         }
         let evidence = clock.time("verify", || self.evidence(pair, initial, &best));
         Ok(Refinement { timings: clock.into_timings(), ..evidence })
@@ -330,14 +325,6 @@ impl Refiner {
     }
 }
 
-impl Refinement {
-    /// The inputs of the confidence, with names.
-    #[must_use]
-    pub fn signals(&self) -> Vec<(&'static str, f64)> {
-        self.evidence.signals().to_vec()
-    }
-}
-
 /// What a round comes to.
 struct Outcome {
     candidate: Candidate,
@@ -374,15 +361,30 @@ impl Round<'_> {
             .time("aggregate", || hypotheses::propose(recipe, &pair.scale, &sets))
             .unwrap_or_default();
         let compared = if recipe.verify {
-            clock.time("verify", || {
-                hypotheses::ranked(pair, start, &proposed, &sets, self.verifier)
-            })
+            clock
+                .time("verify", || hypotheses::ranked(pair, start, &proposed, &sets, self.verifier))
         } else {
             let first = proposed.first().unwrap_or(pose);
             vec![Candidate::judged(*first, true, self.verifier).supported(&sets, pair.scale.voxel)]
         };
         let candidate = *compared.first().unwrap_or(start);
         Ok(Outcome { candidate, sets, compared })
+    }
+
+    /// Further rounds from where an outcome leads, while it is probable and moves.
+    fn until_settled(&self, mut best: Outcome, clock: &mut Stopwatch<'_>) -> Result<Outcome> {
+        for _ in 1..self.refiner.config.recipe.rounds {
+            if self.refiner.config.recipe.verify && !best.candidate.is_probable() {
+                break;
+            }
+            let next = self.from(&best.candidate, clock)?;
+            let settled = next.candidate.settled(&best.candidate, self.pair.scale.voxel);
+            best = best.then(next);
+            if settled {
+                break;
+            }
+        }
+        Ok(best)
     }
 
     /// Rounds from the most believable of the poses that searches find, until one is certain: first those of the usual

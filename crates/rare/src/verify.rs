@@ -114,10 +114,8 @@ impl<'a> Verifier<'a> {
     #[must_use]
     pub fn judge(&self, reference_from_source: &RigidTransform) -> Evidence {
         let (reference, source) = (self.reference, self.source);
-        let body = |cloud: JudgedCloud<'a>| Body {
-            surface: cloud.surface,
-            landmarks: cloud.landmarks,
-        };
+        let body =
+            |cloud: JudgedCloud<'a>| Body { surface: cloud.surface, landmarks: cloud.landmarks };
         let (still, moved) = (reference.landmarks.points(), source.landmarks.points());
         Evidence {
             consistency: visibility::consistency(

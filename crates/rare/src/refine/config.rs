@@ -121,7 +121,7 @@ impl Recipe {
     /// the reduction and interpolation that were recorded with them.
     #[must_use]
     pub fn for_recorded(self, recorded: &Recorded) -> Recipe {
-        let recipe = Recipe { rounds: 1, ..self };
+        let recipe = Recipe { rounds: 1, search: false, ..self };
         match recorded.recording() {
             Some(recording) => Recipe {
                 components: recording.components,

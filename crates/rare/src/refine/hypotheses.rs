@@ -31,18 +31,19 @@ const MOST_PAIRS: usize = 1000;
 const ROUGH_POINTS: usize = 700;
 /// Points of each surface in the final alignment.
 const FINE_POINTS: usize = 5000;
-/// Weight of all matches in the final alignment, relative to that of all surface pairs, where everything overlaps. The
-/// less does, the less of the surfaces' disagreement is noise that averages out.
-const ANCHOR_WEIGHT: f64 = 0.04;
-/// An overlap below this counts as this.
-const LEAST_OVERLAP: f64 = 0.08;
+/// Weight of all matches in the final alignment, relative to that of all surface pairs, where everything overlaps; it
+/// grows with the inverse square of the overlap, because the less overlaps, the less of the surfaces' disagreement is
+/// noise that averages out, ...
+const ANCHOR_WEIGHT: f64 = 0.007;
+/// ... up to this.
+const MOST_ANCHOR_WEIGHT: f64 = 0.4;
 /// Log-odds that the final alignment may cost: less than what noise makes of the evidence.
 const TOLERATED: f64 = 0.3;
 /// What descends from the initial transform is believed more by these log-odds: whoever brings a transform has reasons
 /// for it.
 const PRIOR_OF_INITIAL: f64 = 1.0;
 /// Log-odds beyond which nobody looks for anything better.
-const CERTAIN: f64 = 3.5;
+const CERTAIN: f64 = 3.0;
 
 impl Candidate {
     /// A transform with the evidence of surfaces and sensors.
@@ -65,15 +66,18 @@ impl Candidate {
 
     /// The rank among candidates of which as much is known: log-odds.
     pub(super) fn score(&self) -> f64 {
-        let model =
-            if self.evidence.support.is_some() { Model::CONFIDENCE } else { Model::SCREENING };
         let prior = if self.from_initial { PRIOR_OF_INITIAL } else { 0.0 };
-        model.log_odds(&self.evidence) + prior
+        Model::for_evidence(&self.evidence).log_odds(&self.evidence) + prior
     }
 
     /// Whether nothing better needs to be sought.
     pub(super) fn is_certain(&self) -> bool {
         self.evidence.support.is_some() && Model::CONFIDENCE.log_odds(&self.evidence) > CERTAIN
+    }
+
+    /// Whether it is rather right than wrong, so that another round from it may pay.
+    pub(super) fn is_probable(&self) -> bool {
+        Model::CONFIDENCE.log_odds(&self.evidence) > 0.0
     }
 
     /// Whether the pose hardly moved: less than a tenth of a voxel and 0.1 degrees.
@@ -193,11 +197,10 @@ pub(super) fn screened(
     for (poses, from_initial) in [(by_features, false), (around, true)] {
         let moved = moved_onto_surface(pair, &distinct(poses, voxel));
         let moved = distinct(&moved, voxel);
-        judged.extend(moved.into_iter().map(|pose| Candidate::judged(pose, from_initial, verifier)));
+        judged
+            .extend(moved.into_iter().map(|pose| Candidate::judged(pose, from_initial, verifier)));
     }
-    judged.retain(|other| {
-        !alike(&other.target_from_source, &current.target_from_source, voxel)
-    });
+    judged.retain(|other| !alike(&other.target_from_source, &current.target_from_source, voxel));
     rank(judged, voxel)
 }
 
@@ -225,18 +228,21 @@ pub(super) fn finish(
     verifier: &Verifier<'_>,
 ) -> Candidate {
     let contact = &best.evidence.contact;
-    let overlap = contact.source_share.min(contact.reference_share).max(LEAST_OVERLAP);
+    let overlap = contact.source_share.min(contact.reference_share).max(f64::EPSILON);
     let icp = AnchoredIcp {
-        anchor_weight: ANCHOR_WEIGHT / overlap,
+        anchor_weight: (ANCHOR_WEIGHT / (overlap * overlap)).min(MOST_ANCHOR_WEIGHT),
         ..AnchoredIcp::for_voxel(pair.scale.voxel)
     };
     let views = [SetName::DiffusionReference, SetName::DiffusionSource];
-    let anchors: Vec<Correspondence> =
-        views.iter().filter_map(|&name| sets.of(name)).flat_map(|set| &set.pairs).copied().collect();
+    let anchors: Vec<Correspondence> = views
+        .iter()
+        .filter_map(|&name| sets.of(name))
+        .flat_map(|set| &set.pairs)
+        .copied()
+        .collect();
     let (source, target) = (&pair.source.surface, &pair.target.surface);
     let start = &best.target_from_source;
-    let Ok(aligned) =
-        icp.align(source, target, &sample(source), &sample(target), &anchors, start)
+    let Ok(aligned) = icp.align(source, target, &sample(source), &sample(target), &anchors, start)
     else {
         return *best;
     };
@@ -264,4 +270,3 @@ fn schedule(voxel: f64, reaches: &[f64], tolerance: f64) -> Icp {
         ..Icp::for_voxel(voxel)
     }
 }
-

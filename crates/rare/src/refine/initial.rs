@@ -44,9 +44,7 @@ pub(super) fn estimate(
         InitialMethod::Sc2Pcr => {
             Sc2Pcr::for_voxel(voxel).hypotheses(&putative(pair)?, HYPOTHESES)?
         }
-        InitialMethod::Mac => {
-            Mac::for_voxel(voxel).hypotheses(&putative(pair)?, HYPOTHESES)?
-        }
+        InitialMethod::Mac => Mac::for_voxel(voxel).hypotheses(&putative(pair)?, HYPOTHESES)?,
         InitialMethod::FastMac => {
             let estimator = FastMac { seed, ..FastMac::for_voxel(voxel) };
             estimator.hypotheses(&putative(pair)?, HYPOTHESES)?

@@ -14,7 +14,7 @@ const MATCHES: usize = 3000;
 /// Matches in which consensus is sought over all kinds of descriptors.
 const MATCHES_OF_ALL: usize = 5000;
 /// Distinct hypotheses taken from each set of matches.
-const HYPOTHESES: usize = 20;
+const HYPOTHESES: usize = 15;
 /// Restarts around a transform, ...
 const RESTARTS: usize = 32;
 /// ... which turn (radians about each axis) and shift (voxels along each axis) by at most this: what coarse alignments
@@ -73,9 +73,8 @@ pub(super) fn by_features(
     };
     let estimator = Sc2Pcr::for_voxel(pair.scale.voxel);
     // Matches without consensus have nothing to say.
-    let hypotheses = |pairs: &Vec<Correspondence>| {
-        estimator.hypotheses(pairs, HYPOTHESES).unwrap_or_default()
-    };
+    let hypotheses =
+        |pairs: &Vec<Correspondence>| estimator.hypotheses(pairs, HYPOTHESES).unwrap_or_default();
     let found = sets.iter().flat_map(hypotheses);
     Ok(found.map(|estimate| estimate.target_from_source).collect())
 }

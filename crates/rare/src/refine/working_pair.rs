@@ -174,11 +174,7 @@ impl<'a> WorkingCloud<'a> {
 
     /// What the verification looks at.
     pub(crate) fn judged(&self) -> JudgedCloud<'_> {
-        JudgedCloud {
-            points: &self.points,
-            surface: &self.surface,
-            landmarks: &self.landmarks,
-        }
+        JudgedCloud { points: &self.points, surface: &self.surface, landmarks: &self.landmarks }
     }
 
     /// Fast point feature histograms of the cloud sampled at `sampling` voxels, over at most `neighbours` points within

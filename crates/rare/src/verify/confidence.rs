@@ -32,7 +32,7 @@ impl Verdict {
 }
 
 /// Numbers that the models weigh.
-const SIGNALS: usize = 8;
+const SIGNALS: usize = 7;
 
 impl Evidence {
     /// The evidence as the models weigh it, with names. Counts enter by their logarithms: a thousand agreeing points
@@ -49,7 +49,6 @@ impl Evidence {
             ("normal_agreement", contact.normal_agreement),
             // In standard deviations of what pairs without anything in common would give.
             ("correlation", contact.correlation * (contact.compared as f64).sqrt()),
-            ("log_looseness", contact.looseness.ln_1p()),
             ("support", support.inliers as f64 / support.matches.max(1) as f64),
             ("log_weaker_support", logarithm(support.weaker_inliers)),
         ]
@@ -69,16 +68,18 @@ pub struct Model {
 
 impl Model {
     /// For evidence without support, with which many hypotheses are compared.
-    pub const SCREENING: Model = Model {
-        intercept: -5.0,
-        coefficients: [6.0, -6.6, -12.0, 2.0, 0.3, 0.0, 0.0, 0.0],
-    };
+    pub const SCREENING: Model =
+        Model { intercept: -5.30, coefficients: [3.91, -3.47, -3.37, 1.34, 0.19, 0.0, 0.0] };
 
     /// For evidence with support: the confidence that is reported.
-    pub const CONFIDENCE: Model = Model {
-        intercept: -4.0,
-        coefficients: [5.0, -5.8, -12.0, 1.5, 0.35, 0.0, 4.2, 0.1],
-    };
+    pub const CONFIDENCE: Model =
+        Model { intercept: -2.43, coefficients: [2.48, -3.52, -4.23, 1.41, 0.14, 2.54, 0.26] };
+
+    /// The model for what is known.
+    #[must_use]
+    pub fn for_evidence(evidence: &Evidence) -> Model {
+        if evidence.support.is_some() { Model::CONFIDENCE } else { Model::SCREENING }
+    }
 
     /// The log-odds that a pose with this evidence is right.
     #[must_use]

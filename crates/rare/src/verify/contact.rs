@@ -5,7 +5,7 @@
 //! what all of them have in common is taken away: their correlation over the contact is near 0 for planes that happen
 //! to coincide and near 1 for two scans of one surface.
 
-use nalgebra::{Matrix6, Point3, Vector3, Vector6};
+use nalgebra::Point3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -15,8 +15,6 @@ use crate::pose::IcpTarget;
 
 /// Points per unit of parallel work; independent of the number of threads.
 const CHUNK: usize = 256;
-/// What looseness is called where nothing holds.
-const LOOSEST: f64 = 1000.0;
 /// Landmarks of a cloud that are looked at.
 const PROBES: usize = 1500;
 
@@ -35,9 +33,6 @@ pub struct Contact {
     pub correlation: f64,
     /// Pairs of landmarks whose descriptors were compared; the fewer of both ways.
     pub compared: usize,
-    /// How far the origin of the source moves (root mean square over all directions) for one unit of distance between
-    /// the touching surfaces: large where they can slide or turn on one another, or lie far away. At most 1000.
-    pub looseness: f64,
 }
 
 /// A cloud whose contact is judged.
@@ -55,8 +50,6 @@ struct OneWay {
     cosine: f64,
     correlation: f64,
     compared: usize,
-    /// Mean of `J^T J` over the touching landmarks, turn first, about the origin of the cloud that stands still.
-    information: Matrix6<f64>,
 }
 
 /// The contact of the clouds under a pose.
@@ -77,23 +70,15 @@ pub(super) fn contact(
         normal_agreement: (forth.cosine + back.cosine) / touching,
         correlation: (forth.correlation + back.correlation) / 2.0,
         compared: forth.compared.min(back.compared),
-        looseness: looseness(&forth.information, reference_from_source),
     }
 }
 
-/// From `J^T J / n` of the distances to the tangent planes for a turn and a shift of the source's origin.
-fn looseness(information: &Matrix6<f64>, reference_from_source: &RigidTransform) -> f64 {
-    // The increment is taken about the reference's origin; here about where the source's origin has come to.
-    let origin = Vector3::from(*reference_from_source.translation());
-    let mut about_source = Matrix6::identity();
-    about_source.fixed_view_mut::<3, 3>(3, 0).copy_from(&origin.cross_matrix());
-    let about_source = about_source.transpose() * information * about_source;
-    let covariance = about_source.try_inverse().unwrap_or_else(|| Matrix6::from_element(f64::MAX));
-    let variance = covariance.fixed_view::<3, 3>(3, 3).trace();
-    if variance.is_finite() && variance > 0.0 { variance.sqrt().min(LOOSEST) } else { LOOSEST }
-}
-
-fn one_way(moved: Body<'_>, still: Body<'_>, still_from_moved: &RigidTransform, voxel: f64) -> OneWay {
+fn one_way(
+    moved: Body<'_>,
+    still: Body<'_>,
+    still_from_moved: &RigidTransform,
+    voxel: f64,
+) -> OneWay {
     let points = moved.landmarks.points();
     let step = points.len().div_ceil(PROBES).max(1);
     let probes: Vec<usize> = (0..points.len()).step_by(step).collect();
@@ -101,33 +86,23 @@ fn one_way(moved: Body<'_>, still: Body<'_>, still_from_moved: &RigidTransform, 
         .map(|&index| Probe::new(index, moved, still, still_from_moved, voxel))
         .collect();
     let touching = || found.iter().filter_map(|probe| probe.touch);
-    let mut information = Matrix6::zeros();
-    for Touch { point, across, .. } in touching() {
-        let turn = point.coords.cross(&across);
-        let row = Vector6::new(turn.x, turn.y, turn.z, across.x, across.y, across.z);
-        information += row * row.transpose();
-    }
     let pairs: Vec<(usize, usize)> = found.iter().filter_map(|probe| probe.pair).collect();
     OneWay {
         probes: probes.len(),
         touching: touching().count(),
         squared_distance: touching().map(|touch| touch.distance * touch.distance).sum(),
         cosine: touching().map(|touch| touch.cosine).sum(),
-        information: information / touching().count().max(1) as f64,
         correlation: correlation(moved.landmarks, still.landmarks, &pairs),
         compared: pairs.len(),
     }
 }
 
-/// Where a moved landmark touches the other surface.
+/// How a moved landmark touches the other surface.
 #[derive(Clone, Copy)]
 struct Touch {
-    point: Point3<f64>,
-    /// The other surface's normal.
-    across: Vector3<f64>,
-    /// To its tangent plane.
+    /// Distance to the tangent plane.
     distance: f64,
-    /// Between the normals, either sign.
+    /// Cosine between the normals, either sign.
     cosine: f64,
 }
 
@@ -153,7 +128,7 @@ impl Probe {
         let touch = nearest.and_then(|nearest| {
             let (place, across) = (points.get(nearest.index)?, normals.get(nearest.index)?);
             let (distance, cosine) = ((point - place).dot(across), normal.dot(across).abs());
-            Some(Touch { point, across: *across, distance, cosine })
+            Some(Touch { distance, cosine })
         });
         let met = touch.and_then(|_| still.landmarks.tree().nearest_within(&point, voxel));
         Probe { touch, pair: met.map(|met| (index, met.index)) }
@@ -168,7 +143,8 @@ fn correlation(moved: &Landmarks, still: &Landmarks, pairs: &[(usize, usize)]) -
     }
     let dimension = moved.features().dimension();
     let mut means = [vec![0.0; dimension], vec![0.0; dimension]];
-    let sides = |&(a, b): &(usize, usize)| [moved.features().feature(a), still.features().feature(b)];
+    let sides =
+        |&(a, b): &(usize, usize)| [moved.features().feature(a), still.features().feature(b)];
     for features in pairs.iter().map(sides) {
         for (mean, feature) in means.iter_mut().zip(features) {
             for (mean, &value) in mean.iter_mut().zip(feature) {

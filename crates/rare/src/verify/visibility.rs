@@ -112,7 +112,9 @@ impl OwnView {
     fn count(&self, point: &Point3<f64>, voxel: f64, counts: &mut DepthConsistency) {
         let intrinsics = &self.viewpoint.camera.intrinsics;
         let Some((u, v)) = pixel(point, intrinsics) else { return };
-        let Some(&[nearest, farthest]) = self.surfaces.get(v * intrinsics.width + u) else { return };
+        let Some(&[nearest, farthest]) = self.surfaces.get(v * intrinsics.width + u) else {
+            return;
+        };
         if farthest <= 0.0 {
             return;
         }
@@ -170,9 +172,8 @@ fn surfaces(map: &DepthMap) -> Vec<[f32; 2]> {
             let columns = u.saturating_sub(1)..(u + 2).min(width);
             let around = rows.clone().flat_map(|y| columns.clone().map(move |x| map.at(x, y)));
             let seen = around.filter(|&depth| depth > 0.0);
-            let [nearest, farthest] = seen.fold([f32::INFINITY, 0.0], |[near, far], depth| {
-                [near.min(depth), far.max(depth)]
-            });
+            let [nearest, farthest] = seen
+                .fold([f32::INFINITY, 0.0], |[near, far], depth| [near.min(depth), far.max(depth)]);
             surfaces.push(if farthest > 0.0 { [nearest, farthest] } else { [0.0, 0.0] });
         }
     }

@@ -53,7 +53,7 @@ pub(super) struct Found {
 }
 
 /// All names, for help and errors.
-const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac-50k, ransac-1m, sc2-pcr, sc2-pcr++, mac, fast-mac, refine, refine-paper, refine-no-pca, refine-no-transfer, refine-no-aggregation, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-fallback";
+const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac-50k, ransac-1m, sc2-pcr, sc2-pcr++, mac, fast-mac, refine, refine-paper, refine-no-pca, refine-no-transfer, refine-no-aggregation, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-search, refine-no-verify";
 
 impl Method {
     /// Reads a list of names.
@@ -172,8 +172,9 @@ impl Found {
 }
 
 /// What the confidence of a refinement was computed from.
-fn signals(_: &Refinement) -> Option<BTreeMap<String, f64>> {
-    None
+fn signals(refinement: &Refinement) -> Option<BTreeMap<String, f64>> {
+    let signals = refinement.evidence.signals();
+    Some(signals.into_iter().map(|(name, value)| (name.to_owned(), value)).collect())
 }
 
 fn align(
@@ -219,7 +220,8 @@ impl Kind {
             "refine-one-round" => with(Recipe { rounds: 1, ..recipe }),
             "refine-no-polish" => with(Recipe { polish: false, ..recipe }),
             "refine-no-consensus" => with(Recipe { consensus: false, ..recipe }),
-            "refine-no-fallback" => with(Recipe { verify: false, ..recipe }),
+            "refine-no-search" => with(Recipe { search: false, ..recipe }),
+            "refine-no-verify" => with(Recipe { verify: false, search: false, ..recipe }),
             _ => bail!("--methods {name}: unknown, choose from {NAMES}"),
         })
     }
