@@ -84,8 +84,9 @@ struct Features {
 struct HypothesisRecord {
     target_from_source: Matrix<4>,
     from_initial: bool,
+    /// Whether depth maps were matched from where it lies, or it was only screened.
+    matched: bool,
     probability: f64,
-    evidence: Evidence,
 }
 
 impl From<&Hypothesis> for HypothesisRecord {
@@ -93,9 +94,9 @@ impl From<&Hypothesis> for HypothesisRecord {
         HypothesisRecord {
             target_from_source: rows(&hypothesis.target_from_source),
             from_initial: hypothesis.from_initial,
+            matched: hypothesis.evidence.support.is_some(),
             probability: Model::for_evidence(&hypothesis.evidence)
                 .probability(&hypothesis.evidence),
-            evidence: hypothesis.evidence,
         }
     }
 }

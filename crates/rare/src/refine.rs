@@ -217,8 +217,8 @@ impl Refiner {
         Ok(pair.to_world_pairs(&search::putative(&pair)?))
     }
 
-    /// Rounds of the paper's method from the initial transform until it settles; unless that was enough, from what
-    /// searches find. Then the polish.
+    /// A round of the paper's method from the initial transform; unless that was enough, from what searches find; and
+    /// from the best until it settles. Then the polish.
     fn run(
         &self,
         pair: &WorkingPair<'_>,
@@ -230,11 +230,10 @@ impl Refiner {
         let start = Candidate::judged(*initial, true, &verifier);
         let round = Round { refiner: self, pair, given, verifier: &verifier };
         let mut best = round.from(&start, &mut clock)?;
-        best = round.until_settled(best, &mut clock)?;
         if self.config.recipe.search && !best.candidate.is_certain() {
             best = round.from_searches(best, initial, &mut clock)?;
-            best = round.until_settled(best, &mut clock)?;
         }
+        best = round.until_settled(best, &mut clock)?;
         if self.config.recipe.polish {
             best.candidate = clock.time("polish", || {
                 hypotheses::finish(pair, &best.candidate, &best.sets, &verifier)
@@ -371,12 +370,9 @@ impl Round<'_> {
         Ok(Outcome { candidate, sets, compared })
     }
 
-    /// Further rounds from where an outcome leads, while it is probable and moves.
+    /// Further rounds from where an outcome leads, while it moves.
     fn until_settled(&self, mut best: Outcome, clock: &mut Stopwatch<'_>) -> Result<Outcome> {
         for _ in 1..self.refiner.config.recipe.rounds {
-            if self.refiner.config.recipe.verify && !best.candidate.is_probable() {
-                break;
-            }
             let next = self.from(&best.candidate, clock)?;
             let settled = next.candidate.settled(&best.candidate, self.pair.scale.voxel);
             best = best.then(next);

@@ -43,7 +43,7 @@ const TOLERATED: f64 = 0.3;
 /// for it.
 const PRIOR_OF_INITIAL: f64 = 1.0;
 /// Log-odds beyond which nobody looks for anything better.
-const CERTAIN: f64 = 3.0;
+const CERTAIN: f64 = 2.8;
 
 impl Candidate {
     /// A transform with the evidence of surfaces and sensors.
@@ -73,11 +73,6 @@ impl Candidate {
     /// Whether nothing better needs to be sought.
     pub(super) fn is_certain(&self) -> bool {
         self.evidence.support.is_some() && Model::CONFIDENCE.log_odds(&self.evidence) > CERTAIN
-    }
-
-    /// Whether it is rather right than wrong, so that another round from it may pay.
-    pub(super) fn is_probable(&self) -> bool {
-        Model::CONFIDENCE.log_odds(&self.evidence) > 0.0
     }
 
     /// Whether the pose hardly moved: less than a tenth of a voxel and 0.1 degrees.

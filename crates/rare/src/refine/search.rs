@@ -14,7 +14,7 @@ const MATCHES: usize = 3000;
 /// Matches in which consensus is sought over all kinds of descriptors.
 const MATCHES_OF_ALL: usize = 5000;
 /// Distinct hypotheses taken from each set of matches.
-const HYPOTHESES: usize = 15;
+const HYPOTHESES: usize = 20;
 /// Restarts around a transform, ...
 const RESTARTS: usize = 32;
 /// ... which turn (radians about each axis) and shift (voxels along each axis) by at most this: what coarse alignments
