@@ -41,7 +41,7 @@ const MOST_ANCHOR_WEIGHT: f64 = 0.4;
 const TOLERATED: f64 = 0.3;
 /// What descends from the initial transform is believed more by these log-odds: whoever brings a transform has reasons
 /// for it.
-const PRIOR_OF_INITIAL: f64 = 1.0;
+const PRIOR_OF_INITIAL: f64 = 0.4;
 /// Log-odds beyond which nobody looks for anything better.
 const CERTAIN: f64 = 2.8;
 
