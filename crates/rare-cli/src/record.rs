@@ -95,8 +95,7 @@ impl From<&Hypothesis> for HypothesisRecord {
             target_from_source: rows(&hypothesis.target_from_source),
             from_initial: hypothesis.from_initial,
             matched: hypothesis.evidence.support.is_some(),
-            probability: Model::for_evidence(&hypothesis.evidence)
-                .probability(&hypothesis.evidence),
+            probability: Model::ranking(&hypothesis.evidence).probability(&hypothesis.evidence),
         }
     }
 }

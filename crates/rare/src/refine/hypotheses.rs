@@ -67,12 +67,12 @@ impl Candidate {
     /// The rank among candidates of which as much is known: log-odds.
     pub(super) fn score(&self) -> f64 {
         let prior = if self.from_initial { PRIOR_OF_INITIAL } else { 0.0 };
-        Model::for_evidence(&self.evidence).log_odds(&self.evidence) + prior
+        Model::ranking(&self.evidence).log_odds(&self.evidence) + prior
     }
 
     /// Whether nothing better needs to be sought.
     pub(super) fn is_certain(&self) -> bool {
-        self.evidence.support.is_some() && Model::CONFIDENCE.log_odds(&self.evidence) > CERTAIN
+        self.evidence.support.is_some() && Model::RANKING.log_odds(&self.evidence) > CERTAIN
     }
 
     /// Whether the pose hardly moved: less than a tenth of a voxel and 0.1 degrees.

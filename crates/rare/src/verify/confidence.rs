@@ -57,7 +57,8 @@ impl Evidence {
 
 /// A logistic model: the probability is that of an intercept plus weighted signals.
 ///
-/// The coefficients were fitted to development data and synthetic scenes, see `docs/measurements.md`.
+/// The coefficients were fitted to poses that the refiner compared on development data, and to what it made of scans of
+/// different rooms, see `docs/measurements.md`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Model {
     /// The log-odds without any signal.
@@ -67,18 +68,23 @@ pub struct Model {
 }
 
 impl Model {
-    /// For evidence without support, with which many hypotheses are compared.
+    /// Which of many poses of one pair is right, by evidence without support.
     pub const SCREENING: Model =
-        Model { intercept: -5.30, coefficients: [3.91, -3.47, -3.37, 1.34, 0.19, 0.0, 0.0] };
+        Model { intercept: -6.48, coefficients: [8.63, -6.62, -7.61, 0.03, 0.19, 0.0, 0.0] };
 
-    /// For evidence with support: the confidence that is reported.
+    /// Which of some poses of one pair is right, by evidence with support.
+    pub const RANKING: Model =
+        Model { intercept: -0.62, coefficients: [1.60, -3.86, -9.15, 0.0, 0.24, 4.67, 0.11] };
+
+    /// Whether the best pose of a pair is right, which may have nothing in common: the confidence that is reported. It is
+    /// a model of its own, because a search finds the most deceptive of all poses.
     pub const CONFIDENCE: Model =
-        Model { intercept: -2.43, coefficients: [2.48, -3.52, -4.23, 1.41, 0.14, 2.54, 0.26] };
+        Model { intercept: -17.69, coefficients: [14.42, -1.31, -26.07, 0.0, 0.29, 1.58, 0.70] };
 
-    /// The model for what is known.
+    /// The model that ranks poses of which so much is known.
     #[must_use]
-    pub fn for_evidence(evidence: &Evidence) -> Model {
-        if evidence.support.is_some() { Model::CONFIDENCE } else { Model::SCREENING }
+    pub fn ranking(evidence: &Evidence) -> Model {
+        if evidence.support.is_some() { Model::RANKING } else { Model::SCREENING }
     }
 
     /// The log-odds that a pose with this evidence is right.
