@@ -100,7 +100,7 @@ fn the_default_preset_solves_rooms() {
             .fold((0, 0), |(i, c), set| (i + set.inliers, c + set.correspondences));
         assert_eq!((refinement.inliers, refinement.correspondences), (inliers, all));
         assert_eq!(refinement.sets.len(), 5);
-        assert!(refinement.overlap > 0.3 && refinement.consistency.agreement() > 0.8);
+        assert!(refinement.overlap > 0.3 && refinement.evidence.consistency.agreement() > 0.8);
         assert!(refinement.information[(0, 0)] > 100.0 && refinement.warnings.is_empty());
     }
 }
@@ -172,7 +172,7 @@ fn the_unit_of_length_does_not_matter() {
     let (pose, small_pose) = (metres.target_from_source, small.target_from_source);
     assert_eq!(small_pose.rotation(), pose.rotation());
     assert_eq!(small_pose.translation() / binary, *pose.translation());
-    assert_eq!((small.consistency, &small.sets), (metres.consistency, &metres.sets));
+    assert_eq!((small.evidence, &small.sets), (metres.evidence, &metres.sets));
     assert_eq!(small.scale, metres.scale.in_units(1.0 / binary));
     let ratio = small.information[(4, 4)] / metres.information[(4, 4)];
     assert!((ratio / binary.powi(2) - 1.0).abs() < 1e-9, "{ratio}");
