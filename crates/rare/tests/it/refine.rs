@@ -12,8 +12,8 @@ use rare::scale::{Profile, SceneKind};
 use rare::synthetic::{ScanPair, demo_pair, object_pair, perturb, room_pair, street_pair};
 use rare::verify::{Model, Verdict};
 use rare::{
-    Correspondence, DepthMap, FeatureMap, Hypothesis, InitialMethod, PointCloud, Recipe,
-    Refinement, Refiner, RefinerConfig, RigidTransform, Scan,
+    Correspondence, DepthMap, FeatureMap, InitialMethod, PointCloud, Recipe, Refinement, Refiner,
+    RefinerConfig, RigidTransform, Scan,
 };
 
 use crate::shared;
@@ -305,9 +305,9 @@ fn every_step_can_be_switched_off() {
     assert!(!steps(&proposed, "search") && !steps(&proposed, "polish"));
     // Compared, among others with the initial transform, the first one wins.
     let verified = run(Recipe { verify: true, ..bare.clone() });
-    let initial = |one: &Hypothesis| one.target_from_source.error_to(&pair.initial);
     assert!(verified.hypotheses.len() > 1);
-    assert!(verified.hypotheses.iter().any(|one| initial(one).translation < 1e-9));
+    let compared = verified.hypotheses.iter().map(|one| one.target_from_source);
+    assert!(compared.clone().any(|pose| pose.error_to(&pair.initial).translation < 1e-9));
     assert_eq!(verified.hypotheses[0].target_from_source, verified.target_from_source);
     // Every round compares once more.
     let rounds = run(Recipe { rounds: 2, ..bare.clone() });
