@@ -135,3 +135,94 @@ impl<'a> Verifier<'a> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::data::{Camera, Intrinsics, KdTree};
+    use crate::features::estimate_normals;
+
+    const VOXEL: f64 = 0.05;
+
+    fn along_z(by: f64) -> RigidTransform {
+        RigidTransform::from_translation(Vector3::new(0.0, 0.0, by))
+    }
+
+    #[test]
+    fn support_counts_by_view() {
+        // Pairs that a shift of 1 m along z brings so far apart.
+        let pairs = |apart: &[f64]| -> Vec<Correspondence> {
+            let pair = |&apart: &f64| Correspondence {
+                source: Point3::origin(),
+                target: Point3::new(apart, 0.0, 1.0),
+                score: 1.0,
+            };
+            apart.iter().map(pair).collect()
+        };
+        let reference = pairs(&[0.0, 0.049, 0.051, -0.03]);
+        let source = pairs(&[0.5, 0.02]);
+        let found = Support::new([&reference, &source], &along_z(1.0), VOXEL);
+        assert_eq!(found, Support { matches: 6, inliers: 4, weaker_inliers: 1 });
+        let swapped = Support::new([&source, &reference], &along_z(1.0), VOXEL);
+        assert_eq!(swapped, found);
+        let wrong = Support::new([&reference, &source], &along_z(0.0), VOXEL);
+        assert_eq!(wrong, Support { matches: 6, inliers: 0, weaker_inliers: 0 });
+        assert_eq!(Support::new([&[], &[]], &along_z(0.0), VOXEL), Support::default());
+    }
+
+    /// A plane 2 m before the origin with its index and its descriptors.
+    struct Plane {
+        points: Vec<Point3<f64>>,
+        surface: IcpTarget,
+        landmarks: Landmarks,
+    }
+
+    impl Plane {
+        /// From column `from` of the grid to column 12.
+        fn new(from: i32) -> Plane {
+            let at = |i: i32| f64::from(i) * VOXEL;
+            let columns = (from..12).flat_map(|x| (-12..12).map(move |y| (at(x), at(y))));
+            let points: Vec<Point3<f64>> = columns.map(|(x, y)| Point3::new(x, y, 2.0)).collect();
+            let normals = estimate_normals(&points, &KdTree::new(&points), 2.0 * VOXEL, 20);
+            let indices: Vec<usize> = (0..points.len()).collect();
+            let landmarks =
+                Landmarks::describe(&points, &indices, VOXEL, Some(&Point3::origin())).unwrap();
+            let surface = IcpTarget::new(points.clone(), normals).unwrap();
+            Plane { points, surface, landmarks }
+        }
+
+        fn judged(&self) -> JudgedCloud<'_> {
+            let Plane { points, surface, landmarks } = self;
+            JudgedCloud { points, surface, landmarks }
+        }
+    }
+
+    fn viewpoint(frame: Frame) -> Viewpoint {
+        let intrinsics =
+            Intrinsics { width: 64, height: 64, fx: 80.0, fy: 80.0, cx: 32.0, cy: 32.0 };
+        let camera = Camera { intrinsics, camera_from_world: RigidTransform::identity() };
+        Viewpoint { frame, camera }
+    }
+
+    #[test]
+    fn poses_are_judged_by_sensors_and_surfaces() {
+        let (reference, source) = (Plane::new(-12), Plane::new(0));
+        let judge = |frame, by| {
+            let viewpoints = [viewpoint(frame)];
+            let verifier = Verifier::new(reference.judged(), source.judged(), &viewpoints, VOXEL);
+            verifier.judge(&along_z(by))
+        };
+        let right = judge(Frame::Reference, 0.0);
+        assert_eq!(right.consistency.agree, source.points.len(), "{right:?}");
+        assert_eq!((right.contact.source_share, right.contact.residual), (1.0, 0.0));
+        assert!((0.5..0.6).contains(&right.contact.reference_share), "{right:?}");
+        assert_eq!(right.support, None);
+        // Half a metre behind the one cloud is half a metre before the other; neither touches.
+        let (behind, before) = (judge(Frame::Reference, 0.5), judge(Frame::Source, 0.5));
+        assert!(behind.consistency.occluded > 200 && behind.consistency.violation == 0);
+        assert!(before.consistency.gross_violation > 200 && before.consistency.occluded == 0);
+        assert_eq!((behind.contact, before.contact), (Contact::default(), Contact::default()));
+    }
+}

@@ -62,3 +62,61 @@ impl Landmarks {
         &self.tree
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const VOXEL: f64 = 0.05;
+
+    /// A bumpy sheet 2 m before the origin.
+    fn sheet() -> Vec<Point3<f64>> {
+        let at = |i: i32| f64::from(i) * VOXEL;
+        let grid = (-10..10).flat_map(|x| (-10..10).map(move |y| (at(x), at(y))));
+        grid.map(|(x, y)| Point3::new(x, y, 2.0 + 0.1 * (7.0 * x).sin() * (5.0 * y).cos()))
+            .collect()
+    }
+
+    #[test]
+    fn the_chosen_points_are_described_in_their_order() {
+        let points = sheet();
+        let chosen = [210, 7, 399];
+        let landmarks = Landmarks::describe(&points, &chosen, VOXEL, None).unwrap();
+        assert_eq!(landmarks.points(), chosen.map(|index| points[index]));
+        assert_eq!((landmarks.normals().len(), landmarks.features().dimension()), (3, 33));
+        for (number, &index) in chosen.iter().enumerate() {
+            let found = landmarks.tree().nearest_within(&points[index], 1e-9).unwrap();
+            assert_eq!(found.index, number);
+            let feature = landmarks.features().feature(number);
+            let length: f32 = feature.iter().map(|value| value * value).sum();
+            assert!((length - 1.0).abs() < 1e-5, "{length}");
+        }
+        // The neighbours are those of the whole cloud, not of the chosen points.
+        let all: Vec<usize> = (0..points.len()).collect();
+        let described = Landmarks::describe(&points, &all, VOXEL, None).unwrap();
+        assert_eq!(described.features().feature(210), landmarks.features().feature(0));
+        assert_eq!(described.normals()[7], landmarks.normals()[1]);
+    }
+
+    #[test]
+    fn normals_point_to_the_sensor() {
+        let points = sheet();
+        let all: Vec<usize> = (0..points.len()).collect();
+        for sensor in [Point3::origin(), Point3::new(0.0, 0.0, 4.0)] {
+            let landmarks = Landmarks::describe(&points, &all, VOXEL, Some(&sensor)).unwrap();
+            for (normal, point) in landmarks.normals().iter().zip(&points) {
+                assert!((normal.norm() - 1.0).abs() < 1e-9);
+                assert!(normal.dot(&(sensor - point)) > 0.0, "{point} {normal}");
+            }
+        }
+    }
+
+    #[test]
+    fn indices_out_of_range_are_refused() {
+        let points = sheet();
+        let error = Landmarks::describe(&points, &[0, points.len()], VOXEL, None).unwrap_err();
+        assert!(error.to_string().contains("400"), "{error}");
+        let none = Landmarks::describe(&points, &[], VOXEL, None).unwrap();
+        assert!(none.points().is_empty() && none.normals().is_empty());
+    }
+}

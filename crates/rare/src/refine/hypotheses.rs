@@ -265,3 +265,6 @@ fn schedule(voxel: f64, reaches: &[f64], tolerance: f64) -> Icp {
         ..Icp::for_voxel(voxel)
     }
 }
+
+#[cfg(test)]
+mod tests;

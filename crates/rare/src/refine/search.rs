@@ -128,3 +128,86 @@ pub(super) fn around(
     };
     (0..RESTARTS).map(&mut restart).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::{PointCloud, Scan};
+    use crate::refine::RefinerConfig;
+    use crate::synthetic::room_pair;
+
+    /// Two scans of a room, thinned, and the true pose.
+    fn room() -> (Scan, Scan, RigidTransform) {
+        let pair = room_pair(2, 0.65..=0.8).unwrap();
+        let thin = |cloud: &PointCloud| -> Scan {
+            PointCloud::new(cloud.points().iter().step_by(5).copied().collect()).unwrap().into()
+        };
+        (thin(&pair.source), thin(&pair.target), pair.target_from_source)
+    }
+
+    /// A pose that has nothing to do with the room.
+    fn elsewhere() -> RigidTransform {
+        let turn = Rotation3::new(Vector3::new(1.0, -2.0, 0.5));
+        RigidTransform::new(turn, Vector3::new(7.0, -3.0, 2.0))
+    }
+
+    #[test]
+    fn features_find_the_pose() {
+        let (source, target, truth) = room();
+        let pair = WorkingPair::new(&source, &target, &RefinerConfig::default()).unwrap();
+        let near = |found: &[RigidTransform], pose: &RigidTransform| {
+            let errors = found.iter().map(|found| found.error_to(pose));
+            errors.filter(|e| e.rotation_degrees < 5.0 && e.translation < 0.2).count()
+        };
+        let truth = pair.to_working(&truth);
+        for effort in [Effort::Usual, Effort::Thorough] {
+            let found = by_features(&pair, None, effort).unwrap();
+            assert!(near(&found, &truth) > 0, "{effort:?}: {} poses", found.len());
+            assert_eq!(near(&found, &elsewhere()), 0);
+        }
+        // Matches of another method are asked as well.
+        let given = |source: &Point3<f64>| Correspondence {
+            source: *source,
+            target: elsewhere().apply(source),
+            score: 1.0,
+        };
+        let given: Vec<Correspondence> = pair.source.coarse.iter().step_by(40).map(given).collect();
+        let found = by_features(&pair, Some(&given), Effort::Usual).unwrap();
+        assert!(near(&found, &elsewhere()) > 0 && near(&found, &truth) > 0);
+    }
+
+    #[test]
+    fn restarts_are_seeded_and_stay_around_the_middle() {
+        let (source, target, _) = room();
+        let pair = WorkingPair::new(&source, &target, &RefinerConfig::default()).unwrap();
+        let (pose, voxel) = (elsewhere(), pair.scale.voxel);
+        let restarts = around(&pair, &pose, 1);
+        assert_eq!(restarts.len(), RESTARTS);
+        assert_eq!(restarts, around(&pair, &pose, 1));
+        assert_ne!(restarts, around(&pair, &pose, 2));
+        let points = &pair.source.coarse;
+        let sum: Vector3<f64> = points.iter().map(|point| point.coords).sum();
+        let middle = Point3::from(sum / points.len() as f64);
+        let mut farthest = (0.0_f64, 0.0_f64);
+        for restart in &restarts {
+            let turn = (restart.rotation() * pose.rotation().inverse()).scaled_axis().amax();
+            let shift = (restart.apply(&middle) - pose.apply(&middle)).amax();
+            farthest = (farthest.0.max(turn), farthest.1.max(shift));
+        }
+        let most = (RESTART_TURN, RESTART_SHIFT * voxel);
+        assert!(farthest.0 <= most.0 && farthest.1 <= most.1 + 1e-9, "{farthest:?}");
+        assert!(farthest.0 > 0.9 * most.0 && farthest.1 > 0.9 * most.1, "{farthest:?}");
+    }
+
+    #[test]
+    fn the_best_scored_matches_are_kept_and_shared_alike() {
+        let (source, target, _) = room();
+        let pair = WorkingPair::new(&source, &target, &RefinerConfig::default()).unwrap();
+        let pairs = putative(&pair).unwrap();
+        assert!(pairs.len() > 500 && pairs.len() <= MATCHES, "{}", pairs.len());
+        assert!(pairs.is_sorted_by(|a, b| a.score >= b.score));
+        let many: Vec<Correspondence> = pairs.iter().cycle().take(MATCHES).copied().collect();
+        let both = joined(&[many.clone(), pairs[..9].to_vec()]);
+        assert_eq!(both, [&many[..MATCHES_OF_ALL / 2], &pairs[..9]].concat());
+    }
+}

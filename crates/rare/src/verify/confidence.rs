@@ -100,3 +100,116 @@ impl Model {
         1.0 / (1.0 + (-self.log_odds(evidence)).exp())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::verify::{Contact, DepthConsistency, Support};
+
+    /// What is known of a pose that is neither clearly right nor clearly wrong.
+    fn evidence() -> Evidence {
+        let consistency =
+            DepthConsistency { agree: 600, occluded: 500, violation: 400, gross_violation: 100 };
+        let contact = Contact {
+            normal_agreement: 0.8,
+            correlation: 0.2,
+            compared: 400,
+            ..Contact::default()
+        };
+        let support = Some(Support { matches: 200, inliers: 50, weaker_inliers: 20 });
+        Evidence { consistency, contact, support }
+    }
+
+    #[test]
+    fn signals_are_named_numbers() {
+        let expected = [
+            ("agreement", 0.6),
+            ("occlusion", 1.0 / 3.0),
+            ("gross_violations", 0.1),
+            ("normal_agreement", 0.8),
+            ("correlation", 4.0),
+            ("support", 0.25),
+            ("log_weaker_support", 21.0_f64.ln()),
+        ];
+        for ((name, value), (expected_name, expected)) in
+            evidence().signals().into_iter().zip(expected)
+        {
+            assert_eq!(name, expected_name);
+            assert!((value - expected).abs() < 1e-12, "{name}: {value}");
+        }
+        assert_eq!(Evidence::default().signals().map(|(_, value)| value), [0.0; SIGNALS]);
+    }
+
+    #[test]
+    fn every_signal_counts_as_it_should() {
+        let better: [fn(&mut Evidence); 6] = [
+            |e| e.consistency = DepthConsistency { agree: 700, violation: 300, ..e.consistency },
+            |e| e.consistency.occluded -= 100,
+            |e| e.consistency.gross_violation -= 50,
+            |e| e.contact.normal_agreement += 0.1,
+            |e| e.contact.correlation += 0.1,
+            |e| e.contact.compared += 100,
+        ];
+        let more_support: [fn(&mut Support); 2] = [|s| s.inliers += 10, |s| s.weaker_inliers += 5];
+        let before = evidence();
+        for (number, improve) in better.into_iter().enumerate() {
+            let mut after = before;
+            improve(&mut after);
+            for model in [Model::SCREENING, Model::CONFIDENCE] {
+                assert!(model.probability(&after) > model.probability(&before), "{number}");
+            }
+        }
+        for (number, improve) in more_support.into_iter().enumerate() {
+            let mut after = before;
+            improve(after.support.as_mut().unwrap());
+            let (confidence, screening) = (Model::CONFIDENCE, Model::SCREENING);
+            assert!(confidence.probability(&after) > confidence.probability(&before), "{number}");
+            assert_eq!(screening.probability(&after), screening.probability(&before), "{number}");
+        }
+    }
+
+    #[test]
+    fn coefficients_belong_to_the_signals_in_their_order() {
+        let signals = evidence().signals();
+        for number in 0..SIGNALS {
+            let mut coefficients = [0.0; SIGNALS];
+            coefficients[number] = 2.0;
+            let log_odds = Model { intercept: -1.0, coefficients }.log_odds(&evidence());
+            assert_eq!(log_odds, 2.0 * signals[number].1 - 1.0, "{number}");
+        }
+    }
+
+    #[test]
+    fn probabilities_are_logistic_and_extreme_where_all_agrees() {
+        let model = Model { intercept: 1.5, coefficients: [0.0; SIGNALS] };
+        assert!((model.probability(&evidence()) - 0.817_574_476).abs() < 1e-9);
+        let perfect = Evidence {
+            consistency: DepthConsistency { agree: 1000, ..DepthConsistency::default() },
+            contact: Contact {
+                normal_agreement: 1.0,
+                correlation: 1.0,
+                compared: 1000,
+                ..Contact::default()
+            },
+            support: Some(Support { matches: 500, inliers: 500, weaker_inliers: 250 }),
+        };
+        assert!(Model::CONFIDENCE.probability(&perfect) > 0.99);
+        assert!(Model::CONFIDENCE.probability(&Evidence::default()) < 0.1);
+        assert!(Model::SCREENING.probability(&Evidence::default()) < 0.01);
+    }
+
+    #[test]
+    fn the_model_is_that_for_what_is_known() {
+        assert_eq!(Model::for_evidence(&evidence()), Model::CONFIDENCE);
+        let unmatched = Evidence { support: None, ..evidence() };
+        assert_eq!(Model::for_evidence(&unmatched), Model::SCREENING);
+    }
+
+    #[test]
+    fn the_verdict_follows_the_confidence_first() {
+        assert_eq!(Verdict::of(REJECT_BELOW - 1e-9, false), Verdict::Rejected);
+        assert_eq!(Verdict::of(REJECT_BELOW - 1e-9, true), Verdict::Rejected);
+        assert_eq!(Verdict::of(REJECT_BELOW, true), Verdict::KeptInitial);
+        assert_eq!(Verdict::of(REJECT_BELOW, false), Verdict::Refined);
+    }
+}

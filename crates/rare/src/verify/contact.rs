@@ -165,3 +165,123 @@ fn correlation(moved: &Landmarks, still: &Landmarks, pairs: &[(usize, usize)]) -
     let product = (first * second).sqrt();
     if product > 0.0 { both / product } else { 0.0 }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Rotation3, Vector3};
+
+    use super::*;
+    use crate::features::estimate_normals;
+    use crate::random::Random;
+
+    const VOXEL: f64 = 0.05;
+
+    struct Surface {
+        target: IcpTarget,
+        landmarks: Landmarks,
+    }
+
+    impl Surface {
+        fn new(points: Vec<Point3<f64>>) -> Surface {
+            let indices: Vec<usize> = (0..points.len()).collect();
+            let sensor = Point3::new(0.0, 0.0, 5.0);
+            let landmarks = Landmarks::describe(&points, &indices, VOXEL, Some(&sensor)).unwrap();
+            let normals = estimate_normals(&points, landmarks.tree(), 2.0 * VOXEL, 20);
+            Surface { target: IcpTarget::new(points, normals).unwrap(), landmarks }
+        }
+
+        fn body(&self) -> Body<'_> {
+            Body { surface: &self.target, landmarks: &self.landmarks }
+        }
+    }
+
+    /// A table of 3 m x 3 m with `count` things of some 20 cm on it, a point per voxel.
+    fn table(seed: u64, count: usize) -> Surface {
+        let mut random = Random::new(seed, 0);
+        let mut thing = |_| {
+            let mut between = |low: f64, high: f64| low + (high - low) * random.uniform();
+            (between(-1.3, 1.3), between(-1.3, 1.3), between(0.08, 0.2), between(0.05, 0.2))
+        };
+        let things: Vec<(f64, f64, f64, f64)> = (0..count).map(&mut thing).collect();
+        let height = |x: f64, y: f64| -> f64 {
+            let above = |&(u, v, radius, height): &(f64, f64, f64, f64)| {
+                let apart = ((x - u).powi(2) + (y - v).powi(2)) / (radius * radius);
+                if apart < 1.0 { height * (1.0 - apart).sqrt() } else { 0.0 }
+            };
+            things.iter().map(above).fold(0.0, f64::max)
+        };
+        let at = |step: i32| f64::from(step) * VOXEL;
+        let grid = (-30..30).flat_map(|i| (-30..30).map(move |j| (at(i), at(j))));
+        Surface::new(grid.map(|(x, y)| Point3::new(x, y, height(x, y))).collect())
+    }
+
+    fn moved_by(x: f64, y: f64, z: f64) -> RigidTransform {
+        RigidTransform::from_translation(Vector3::new(x, y, z))
+    }
+
+    #[test]
+    fn a_surface_meets_itself() {
+        let table = table(1, 30);
+        let found = contact(table.body(), table.body(), &RigidTransform::identity(), VOXEL);
+        assert_eq!((found.source_share, found.reference_share), (1.0, 1.0));
+        assert!(found.residual < 1e-12 && (found.correlation - 1.0).abs() < 1e-9, "{found:?}");
+        assert!((found.normal_agreement - 1.0).abs() < 1e-3, "{found:?}");
+        // 3600 landmarks, every third of them.
+        assert_eq!(found.compared, 1200);
+    }
+
+    #[test]
+    fn planes_that_slide_have_nothing_in_common() {
+        let (first, second) = (table(1, 30), table(2, 30));
+        let slid = |surface: &Surface, pose| contact(first.body(), surface.body(), &pose, VOXEL);
+        for found in [slid(&second, moved_by(0.3, 0.2, 0.0)), slid(&first, moved_by(0.6, 0.4, 0.0))]
+        {
+            println!("{found:?}");
+            // Measured: 0.15 and 0.19; things on tables have edges in common.
+            assert!(found.correlation.abs() < 0.3 && found.compared > 500, "{found:?}");
+            assert!(found.normal_agreement > 0.9, "{found:?}");
+        }
+        let right = slid(&first, moved_by(0.01, -0.01, 0.005));
+        assert!(right.correlation > 0.9, "{right:?}");
+    }
+
+    #[test]
+    fn distances_and_angles_are_those_between_the_surfaces() {
+        let plane = table(1, 0);
+        let lifted = |by| contact(plane.body(), plane.body(), &moved_by(0.0, 0.0, by), VOXEL);
+        let found = lifted(0.02);
+        assert!((found.residual - 0.4).abs() < 1e-9 && found.source_share == 1.0, "{found:?}");
+        assert_eq!(lifted(0.06), Contact::default());
+        let turn = Rotation3::from_axis_angle(&Vector3::x_axis(), 0.5);
+        let turned = RigidTransform::new(turn, Vector3::zeros());
+        let found = contact(plane.body(), plane.body(), &turned, VOXEL);
+        // They touch along a line.
+        assert!((found.normal_agreement - 0.5_f64.cos()).abs() < 1e-9, "{found:?}");
+        assert!(found.source_share > 0.0 && found.source_share < 0.1, "{found:?}");
+    }
+
+    #[test]
+    fn shares_belong_to_their_cloud() {
+        let plane = table(1, 0);
+        let points = plane.landmarks.points().iter().filter(|point| point.x < 0.0).copied();
+        let half = Surface::new(points.collect());
+        let identity = RigidTransform::identity();
+        let found = contact(plane.body(), half.body(), &identity, VOXEL);
+        assert_eq!(found.source_share, 1.0);
+        assert!((found.reference_share - 0.5).abs() < 0.03, "{found:?}");
+        let back = contact(half.body(), plane.body(), &identity, VOXEL);
+        assert_eq!(back.source_share, found.reference_share);
+        assert_eq!(back.reference_share, found.source_share);
+    }
+
+    #[test]
+    fn few_pairs_say_nothing() {
+        let table = table(1, 30);
+        let of = |count: usize| {
+            let pairs: Vec<(usize, usize)> = (0..count).map(|i| (37 * i, 37 * i)).collect();
+            correlation(&table.landmarks, &table.landmarks, &pairs)
+        };
+        assert_eq!((of(0), of(9)), (0.0, 0.0));
+        assert!((of(10) - 1.0).abs() < 1e-9);
+    }
+}

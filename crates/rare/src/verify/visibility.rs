@@ -179,3 +179,147 @@ fn surfaces(map: &DepthMap) -> Vec<[f32; 2]> {
     }
     surfaces
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::data::Camera;
+
+    /// At a depth of 2 m the tolerance is 3 cm + 2 cm.
+    const VOXEL: f64 = 0.05;
+
+    /// A camera at the origin, 64 x 48 pixels: 16 x 12 of the pixels that are compared.
+    fn viewpoint(frame: Frame) -> Viewpoint {
+        let intrinsics =
+            Intrinsics { width: 64, height: 48, fx: 64.0, fy: 64.0, cx: 32.0, cy: 24.0 };
+        let camera = Camera { intrinsics, camera_from_world: RigidTransform::identity() };
+        Viewpoint { frame, camera }
+    }
+
+    /// A point in a shrunk pixel.
+    fn at(u: usize, v: usize, z: f64) -> Point3<f64> {
+        let camera = shrunk(&viewpoint(Frame::Reference)).camera.intrinsics;
+        camera.back_project(u as f64 + 0.25, v as f64 + 0.25, z)
+    }
+
+    /// One point per pixel of some columns.
+    fn plane(z: f64, columns: std::ops::Range<usize>) -> Vec<Point3<f64>> {
+        (0..12).flat_map(|v| columns.clone().map(move |u| at(u, v, z))).collect()
+    }
+
+    fn along_z(by: f64) -> RigidTransform {
+        RigidTransform::from_translation(Vector3::new(0.0, 0.0, by))
+    }
+
+    /// What a camera that sees `own` says of `moved`, which stands where it is.
+    fn counts(own: &[Point3<f64>], moved: &[Point3<f64>]) -> DepthConsistency {
+        let view = OwnView::new(&viewpoint(Frame::Reference), own);
+        view.compare(moved, &RigidTransform::identity(), VOXEL)
+    }
+
+    #[test]
+    fn points_are_counted_by_who_stands_in_front() {
+        let own = plane(2.0, 0..16);
+        let agree = DepthConsistency { agree: 1, ..DepthConsistency::default() };
+        let occluded = DepthConsistency { occluded: 1, ..DepthConsistency::default() };
+        let violation = DepthConsistency { violation: 1, ..DepthConsistency::default() };
+        let gross = DepthConsistency { gross_violation: 1, ..violation };
+        // The tolerance is that at the depth of the point: 4.95 cm, 5 cm, 5.05 cm; four of them are gross.
+        for (z, expected) in [
+            (1.79, gross),
+            (1.82, violation),
+            (1.948, violation),
+            (1.952, agree),
+            (2.0, agree),
+            (2.048, agree),
+            (2.052, occluded),
+            (3.0, occluded),
+        ] {
+            assert_eq!(counts(&own, &[at(5, 5, z)]), expected, "{z}");
+        }
+    }
+
+    #[test]
+    fn a_depth_edge_accuses_nobody() {
+        let mut own = plane(2.0, 0..8);
+        own.extend(plane(3.0, 8..16));
+        // Between the surfaces, in the columns of the edge: either may be seen there.
+        for u in [7, 8] {
+            for z in [2.0, 2.5, 3.0] {
+                let found = counts(&own, &[at(u, 5, z)]);
+                assert_eq!((found.agree, found.violation), (1, 0), "{u} {z}: {found:?}");
+            }
+        }
+        assert_eq!(counts(&own, &[at(6, 5, 2.5)]).occluded, 1);
+        assert_eq!(counts(&own, &[at(9, 5, 2.5)]).gross_violation, 1);
+    }
+
+    #[test]
+    fn only_what_the_camera_can_compare_counts() {
+        let own = plane(2.0, 0..8);
+        let nothing = DepthConsistency::default();
+        // The pixels beside the surface belong to its edge, those beyond show nothing.
+        assert_eq!(counts(&own, &[at(8, 5, 2.0)]).agree, 1);
+        assert_eq!(counts(&own, &[at(9, 5, 2.0)]), nothing);
+        // Behind the camera, and beside its image.
+        assert_eq!(counts(&own, &[Point3::new(0.0, 0.0, -2.0), at(16, 5, 2.0)]), nothing);
+        assert_eq!(counts(&[], &own), nothing);
+    }
+
+    #[test]
+    fn the_frames_change_their_roles() {
+        let (reference, source) = (plane(2.0, 0..8), plane(2.0, 0..5));
+        let seen_by = |frame, by| {
+            let own = if frame == Frame::Reference { &reference } else { &source };
+            let views = [OwnView::new(&viewpoint(frame), own)];
+            consistency(&views, &reference, &source, &along_z(by), VOXEL)
+        };
+        // The reference's camera sees all 5 x 12 points of the source; the source's one sees the edge's neighbours, too.
+        let exact = DepthConsistency { agree: 60, ..DepthConsistency::default() };
+        assert_eq!(seen_by(Frame::Reference, 0.0), exact);
+        assert_eq!(seen_by(Frame::Source, 0.0), DepthConsistency { agree: 72, ..exact });
+        // Farther from the one is nearer to the other.
+        let (behind, before) = (seen_by(Frame::Reference, 0.1), seen_by(Frame::Source, 0.1));
+        assert!(behind.occluded >= 50 && behind.agree + behind.violation == 0, "{behind:?}");
+        assert!(before.violation >= 50 && before.agree + before.occluded == 0, "{before:?}");
+    }
+
+    #[test]
+    fn the_counts_of_all_cameras_add_up() {
+        let (reference, source) = (plane(2.0, 0..8), plane(1.9, 0..5));
+        let view = |frame, own: &[Point3<f64>]| OwnView::new(&viewpoint(frame), own);
+        let found = |views: &[OwnView]| {
+            consistency(views, &reference, &source, &RigidTransform::identity(), VOXEL)
+        };
+        let first = found(&[view(Frame::Reference, &reference)]);
+        let second = found(&[view(Frame::Source, &source)]);
+        assert!(first.violation == 60 && second.occluded == 72, "{first:?} {second:?}");
+        let both = [view(Frame::Reference, &reference), view(Frame::Source, &source)];
+        assert_eq!(found(&both), first.add(second));
+        assert_eq!(found(&[]), DepthConsistency::default());
+    }
+
+    #[test]
+    fn shares_follow_the_counts() {
+        let counts =
+            DepthConsistency { agree: 30, occluded: 60, violation: 10, gross_violation: 4 };
+        assert_eq!(
+            (counts.agreement(), counts.occlusion(), counts.gross_share()),
+            (0.75, 0.6, 0.1)
+        );
+        let sum = counts.add(DepthConsistency {
+            agree: 1,
+            occluded: 2,
+            violation: 3,
+            gross_violation: 4,
+        });
+        let expected =
+            DepthConsistency { agree: 31, occluded: 62, violation: 13, gross_violation: 8 };
+        assert_eq!(sum, expected);
+        let nothing = DepthConsistency::default();
+        let shares = [nothing.agreement(), nothing.occlusion(), nothing.gross_share()];
+        assert_eq!(shares, [0.0; 3]);
+    }
+}
