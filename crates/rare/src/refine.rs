@@ -229,9 +229,9 @@ impl Refiner {
         let verifier = clock.time("verify", || self.verifier(pair, initial));
         let start = Candidate::judged(*initial, true, &verifier);
         let round = Round { refiner: self, pair, given, verifier: &verifier };
-        let mut best = round.from(&start, &mut clock)?;
+        let mut best = round.begin_at(&start, &mut clock)?;
         if self.config.recipe.search && !best.candidate.is_certain() {
-            best = round.from_searches(best, initial, &mut clock)?;
+            best = round.search_from(best, initial, &mut clock)?;
         }
         best = round.until_settled(best, &mut clock)?;
         if self.config.recipe.polish {
@@ -350,7 +350,7 @@ struct Round<'a> {
 
 impl Round<'_> {
     /// The best of the starting pose and what the sets that are seen from it propose.
-    fn from(&self, start: &Candidate, clock: &mut Stopwatch<'_>) -> Result<Outcome> {
+    fn begin_at(&self, start: &Candidate, clock: &mut Stopwatch<'_>) -> Result<Outcome> {
         let (refiner, pair) = (self.refiner, self.pair);
         let recipe = &refiner.config.recipe;
         let pose = &start.target_from_source;
@@ -373,7 +373,7 @@ impl Round<'_> {
     /// Further rounds from where an outcome leads, while it moves.
     fn until_settled(&self, mut best: Outcome, clock: &mut Stopwatch<'_>) -> Result<Outcome> {
         for _ in 1..self.refiner.config.recipe.rounds {
-            let next = self.from(&best.candidate, clock)?;
+            let next = self.begin_at(&best.candidate, clock)?;
             let settled = next.candidate.settled(&best.candidate, self.pair.scale.voxel);
             best = best.then(next);
             if settled {
@@ -385,7 +385,7 @@ impl Round<'_> {
 
     /// Rounds from the most believable of the poses that searches find, until one is certain: first those of the usual
     /// descriptors and around the initial transform, then those of others.
-    fn from_searches(
+    fn search_from(
         &self,
         mut best: Outcome,
         initial: &RigidTransform,
@@ -401,7 +401,7 @@ impl Round<'_> {
             let starts = clock.time("verify", || {
                 hypotheses::screened(pair, &found, &around, &best.candidate, self.verifier)
             });
-            best = self.from_best(best, &starts, clock)?;
+            best = self.best_of(best, &starts, clock)?;
             if best.candidate.is_certain() {
                 break;
             }
@@ -410,7 +410,7 @@ impl Round<'_> {
     }
 
     /// Rounds from the first few starts, until one is certain; the best outcome.
-    fn from_best(
+    fn best_of(
         &self,
         mut best: Outcome,
         starts: &[Candidate],
@@ -418,7 +418,7 @@ impl Round<'_> {
     ) -> Result<Outcome> {
         best.compared.extend(starts);
         for start in starts.iter().take(hypotheses::SCREENED) {
-            let next = self.from(start, clock)?;
+            let next = self.begin_at(start, clock)?;
             if next.candidate.score() > best.candidate.score() {
                 best = best.then(next);
             } else {

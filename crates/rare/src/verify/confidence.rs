@@ -200,9 +200,9 @@ mod tests {
 
     #[test]
     fn the_model_is_that_for_what_is_known() {
-        assert_eq!(Model::for_evidence(&evidence()), Model::CONFIDENCE);
+        assert_eq!(Model::ranking(&evidence()), Model::RANKING);
         let unmatched = Evidence { support: None, ..evidence() };
-        assert_eq!(Model::for_evidence(&unmatched), Model::SCREENING);
+        assert_eq!(Model::ranking(&unmatched), Model::SCREENING);
     }
 
     #[test]
