@@ -236,7 +236,6 @@ mod tests {
         let slid = |surface: &Surface, pose| contact(first.body(), surface.body(), &pose, VOXEL);
         for found in [slid(&second, moved_by(0.3, 0.2, 0.0)), slid(&first, moved_by(0.6, 0.4, 0.0))]
         {
-            println!("{found:?}");
             // Measured: 0.15 and 0.19; things on tables have edges in common.
             assert!(found.correlation.abs() < 0.3 && found.compared > 500, "{found:?}");
             assert!(found.normal_agreement > 0.9, "{found:?}");

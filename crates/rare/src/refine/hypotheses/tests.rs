@@ -219,7 +219,6 @@ fn a_screening_brings_poses_onto_the_surface_and_says_where_they_are_from() {
         let found = screened(pair, &[room.wrong, room.near], &[], &current, verifier);
         let error = found[0].target_from_source.error_to(&room.truth);
         // Measured: 0.4 degrees and 7 mm.
-        println!("{error:?}");
         assert!(error.rotation_degrees < 1.0 && error.translation < 0.04, "{error:?}");
         assert!(found.iter().all(|one| !one.from_initial && one.evidence.support.is_none()));
         let around = screened(pair, &[], &[room.near], &current, verifier);
@@ -240,7 +239,6 @@ fn the_winner_is_finished_unless_that_does_harm() {
         let finished = finish(pair, &judged(room.near), &sets, verifier);
         let error = finished.target_from_source.error_to(&room.truth);
         // Measured: 0.03 degrees and 2 mm.
-        println!("{error:?}");
         assert!(error.rotation_degrees < 0.5 && error.translation < 0.02, "{error:?}");
         assert_eq!(finished, judged(finished.target_from_source));
         // Where no surface is nothing is done.
