@@ -167,6 +167,31 @@ fn what_does_not_fit_is_refused() {
 }
 
 #[test]
+fn methods_without_single_steps_are_evaluated() {
+    let workplace = benchmark();
+    let methods = ["refine", "refine-no-search", "refine-no-verify"];
+    let names = methods.join(",");
+    let more = ["--methods", &names, "--limit", "3"];
+    finish(command(&workplace, "out", &more).spawn().unwrap());
+    let results = lines(&workplace, "out");
+    assert_eq!(results.len(), methods.len() * 3);
+    let of = |method: &str| -> Vec<Value> {
+        let found = results.iter().filter(|line| line["method"] == method);
+        found.map(|line| line["signals"].clone()).collect()
+    };
+    for method in methods {
+        let found = of(method);
+        assert_eq!(found.len(), 3, "{method}");
+        for signals in found {
+            assert!(signals["agreement"].is_number() && signals["log_weaker_support"].is_number());
+        }
+    }
+    assert_ne!(of("refine"), of("refine-no-verify"));
+    let gone = ["eval", "folder", "room", "--methods", "refine-no-fallback", "--out", "x"];
+    workplace.run(&gone).assert_refused(&["refine-no-fallback", "refine-no-verify"]);
+}
+
+#[test]
 fn ten_thousand_pairs_are_scored_at_once() {
     let workplace = Workplace::empty();
     let (mut gt, mut info, mut est) = (String::new(), String::new(), String::new());

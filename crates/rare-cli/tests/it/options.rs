@@ -23,6 +23,31 @@ fn a_configuration_file_equals_flags_and_flags_win() {
 }
 
 #[test]
+fn steps_are_switched_off_by_flags_and_by_files() {
+    let workplace = Workplace::with_pair();
+    let steps = |more: &[&str]| {
+        let outcome = workplace.refine(&[&["--json", "out.json"], more].concat());
+        assert_eq!(outcome.code, 0, "{outcome:?}");
+        let recipe = workplace.json("out.json")["config"]["recipe"].clone();
+        ["verify", "search", "polish"].map(|step| recipe[step].as_bool().unwrap())
+    };
+    assert_eq!(steps(&[]), [true, true, true]);
+    assert_eq!(steps(&["--no-search"]), [true, false, true]);
+    assert_eq!(steps(&["--no-polish"]), [true, true, false]);
+    // Where nothing is compared nothing is sought.
+    assert_eq!(steps(&["--no-verify"]), [false, false, true]);
+    assert_eq!(workplace.json("out.json")["hypotheses"].as_array().unwrap().len(), 2);
+    workplace.write("rare.toml", "no-polish = true\nno-search = true\n");
+    assert_eq!(steps(&["--config", "rare.toml"]), [true, false, false]);
+    let timings = workplace.json("out.json")["timings_s"].clone();
+    assert!(timings["polish"].is_null() && timings["search"].is_null(), "{timings}");
+    workplace.write("rare.toml", "no-verify = true\nno-search = false\n");
+    assert_eq!(steps(&["--config", "rare.toml", "--no-polish"]), [false, false, false]);
+    workplace.write("rare.toml", "no-polish = \"yes\"\n");
+    workplace.refine(&["--config", "rare.toml"]).assert_refused(&["rare.toml", "line 1"]);
+}
+
+#[test]
 fn an_unknown_key_of_a_configuration_file_is_named() {
     let workplace = Workplace::with_pair();
     workplace.write("rare.toml", "seed = 1\nvoxels = 0.05\n");

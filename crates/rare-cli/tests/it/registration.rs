@@ -7,15 +7,18 @@ use rare::nalgebra::{Point3, Vector3};
 use crate::shared::{Outcome, Workplace, about, keys, pair, shifted, start, truth};
 
 /// The keys of the record, in the order of the alphabet.
-const KEYS: [&str; 13] = [
+const KEYS: [&str; 16] = [
     "confidence",
     "config",
     "correspondences",
+    "evidence",
+    "hypotheses",
     "information",
     "initial",
     "inliers",
     "overlap",
     "sets",
+    "signals",
     "target_from_source",
     "timings_s",
     "verdict",
@@ -53,6 +56,40 @@ fn a_wrong_start_is_refined() {
     let mut evidence = record;
     evidence["config"].take();
     assert_eq!(evidence.to_string().matches("null").count(), 1);
+}
+
+#[test]
+fn the_record_says_what_was_compared_and_why() {
+    let workplace = Workplace::with_pair();
+    assert_eq!(workplace.refine(&["--json", "out.json"]).code, 0);
+    let record = workplace.json("out.json");
+    let mut signals = [
+        "agreement",
+        "occlusion",
+        "gross_violations",
+        "normal_agreement",
+        "correlation",
+        "support",
+        "log_weaker_support",
+    ];
+    signals.sort_unstable();
+    assert_eq!(keys(&record["signals"]), signals);
+    assert_eq!(keys(&record["evidence"]), ["consistency", "contact", "support"]);
+    let evidence = &record["evidence"];
+    let number = |value: &serde_json::Value| value.as_f64().unwrap();
+    let support = &evidence["support"];
+    let share = number(&support["inliers"]) / number(&support["matches"]);
+    assert!((number(&record["signals"]["support"]) - share).abs() < 1e-12 && share > 0.0);
+    let contact = number(&evidence["contact"]["normal_agreement"]);
+    assert_eq!(number(&record["signals"]["normal_agreement"]), contact);
+    // The initial transform was one of those compared; all are probabilities of something.
+    let hypotheses = record["hypotheses"].as_array().unwrap();
+    assert!(hypotheses.len() > 1);
+    assert!(hypotheses.iter().any(|one| one["target_from_source"] == record["initial"]));
+    for one in hypotheses {
+        assert_eq!(keys(one), ["from_initial", "matched", "probability", "target_from_source"]);
+        assert!((0.0..=1.0).contains(&number(&one["probability"])) && one["matched"].is_boolean());
+    }
 }
 
 #[test]
