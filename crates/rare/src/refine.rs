@@ -34,11 +34,13 @@ use crate::verify::{Evidence, Model, Verdict, Verifier};
 /// Refines initial transforms between clouds.
 ///
 /// ```
+/// use rare::scale::Profile;
 /// use rare::{Refiner, RefinerConfig, Scan, synthetic};
 /// // Two scans of a thing on a table, and a start that is 10 degrees and 3 cm off.
 /// let pair = synthetic::object_pair(1)?;
 /// let (source, target) = (Scan::from(pair.source), Scan::from(pair.target));
-/// let refiner = Refiner::new(RefinerConfig::default());
+/// // No sensor stood at the origin of its frame.
+/// let refiner = Refiner::new(RefinerConfig { profile: Profile::Object, ..RefinerConfig::default() });
 /// let refinement = refiner.refine(&source, &target, &pair.initial)?;
 /// let error = refinement.target_from_source.error_to(&pair.target_from_source);
 /// assert!(error.rotation_degrees < 1.0 && error.translation < 0.005);

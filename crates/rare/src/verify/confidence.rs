@@ -57,8 +57,8 @@ impl Evidence {
 
 /// A logistic model: the probability is that of an intercept plus weighted signals.
 ///
-/// The coefficients were fitted to poses that the refiner compared on development data, and to what it made of scans of
-/// different rooms, see `docs/measurements.md`.
+/// The coefficients were fitted to poses that the refiner compared on development data, and to what it made of simulated
+/// scans and of scans of different rooms, see `docs/measurements.md`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Model {
     /// The log-odds without any signal.
@@ -79,7 +79,7 @@ impl Model {
     /// Whether the best pose of a pair is right, which may have nothing in common: the confidence that is reported. It is
     /// a model of its own, because a search finds the most deceptive of all poses.
     pub const CONFIDENCE: Model =
-        Model { intercept: -17.69, coefficients: [14.42, -1.31, -26.07, 0.0, 0.29, 1.58, 0.70] };
+        Model { intercept: -16.54, coefficients: [10.03, -2.13, -9.62, 2.71, 0.17, 3.30, 0.91] };
 
     /// The model that ranks poses of which so much is known.
     #[must_use]

@@ -22,7 +22,7 @@ fn pair() -> Pair {
 }
 
 fn one_round(camera: CameraChoice) -> RefinerConfig {
-    let recipe = Recipe { rounds: 1, ..Recipe::default() };
+    let recipe = Recipe { rounds: 1, search: false, ..Recipe::default() };
     RefinerConfig { camera, recipe, ..RefinerConfig::default() }
 }
 

@@ -29,6 +29,7 @@ mod ransac;
 mod real_pairs;
 mod reduce;
 mod refine;
+mod refined_real_pairs;
 mod sc2_pcr;
 mod sc2_pcr_plus_plus;
 mod shared;

@@ -214,7 +214,6 @@ fn a_start_without_overlap_is_believed_only_if_it_is_put_right() {
 }
 
 #[test]
-#[ignore = "known defect: clouds of two different rooms are believed with a confidence of 0.5 to 0.96"]
 fn two_different_rooms_are_rejected() {
     let pair = room();
     let other = Pair::room(9);
