@@ -256,14 +256,14 @@ impl Options {
     }
 
     /// The recipe without the steps that are switched off. A search is worth nothing where nothing is compared.
-    fn without_steps(&self, recipe: Recipe) -> Recipe {
+    fn without_steps(&self, recipe: &Recipe) -> Recipe {
         let kept = |off: Option<bool>| !off.unwrap_or(false);
         let verify = recipe.verify && kept(self.no_verify);
         Recipe {
             verify,
             search: recipe.search && verify && kept(self.no_search),
             polish: recipe.polish && kept(self.no_polish),
-            ..recipe
+            ..recipe.clone()
         }
     }
 
