@@ -250,8 +250,10 @@ impl Options {
             camera: self.camera.unwrap_or_default(),
             voxel: self.voxel,
             seed: self.seed.unwrap_or(0),
-            recipe: self
-                .without_steps(Recipe { rounds: self.rounds(encoder, recipe.rounds)?, ..recipe }),
+            recipe: Recipe {
+                rounds: self.rounds(encoder, recipe.rounds)?,
+                ..self.without_steps(&recipe)
+            },
         })
     }
 
