@@ -4,7 +4,7 @@
 //! not stand in space that was seen to be empty; a wrong pose violates free space however many correspondences vote for
 //! it. *Contact*: where the surfaces touch they must be close, parallel, and the same things must meet. *Support*: depth
 //! maps rendered under the right pose show the same things at the same places, so their features match there.
-//! [`confidence`] weighs them; poses are ranked, accepted and refused by nothing else.
+//! [`Model`] weighs them; poses are ranked, accepted and refused by nothing else.
 
 mod confidence;
 mod contact;
