@@ -232,11 +232,13 @@ impl Refiner {
         let start = Candidate::judged(*initial, true, &verifier);
         let round = Round { refiner: self, pair, given, verifier: &verifier };
         let mut best = round.begin_at(&start, &mut clock)?;
-        if self.config.recipe.search && !best.candidate.is_certain() {
+        let recipe = &self.config.recipe;
+        // Where nothing is compared, there is nothing to seek.
+        if recipe.verify && recipe.search && !best.candidate.is_certain() {
             best = round.search_from(best, initial, &mut clock)?;
         }
         best = round.until_settled(best, &mut clock)?;
-        if self.config.recipe.polish {
+        if recipe.polish {
             best.candidate = clock.time("polish", || {
                 hypotheses::finish(pair, &best.candidate, &best.sets, &verifier)
             });

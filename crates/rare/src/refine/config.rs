@@ -47,7 +47,7 @@ pub struct Recipe {
     /// Whether, unless the initial transform leads to something certain, transforms are sought by 3D features and around
     /// the initial one.
     pub search: bool,
-    /// Whether the result is polished by robust point-to-plane ICP, kept only if it verifies better.
+    /// Whether the surfaces are aligned at the end, held by the matches of the depth maps; undone if it verifies worse.
     pub polish: bool,
     /// Times the weights are recomputed from the surviving inliers (`N_r` of section 3.3).
     pub reweighting_rounds: usize,

@@ -58,9 +58,8 @@ impl Candidate {
 
     /// The same with what the depth maps say in addition.
     pub(super) fn supported(mut self, sets: &CorrespondenceSets, voxel: f64) -> Candidate {
-        let of = |name| sets.of(name).map_or(&[][..], |set| &set.pairs);
-        let views = [of(SetName::DiffusionReference), of(SetName::DiffusionSource)];
-        self.evidence.support = Some(Support::new(views, &self.target_from_source, voxel));
+        let matches = depth_map_matches(sets);
+        self.evidence.support = Some(Support::new(matches, &self.target_from_source, voxel));
         self
     }
 
@@ -80,6 +79,12 @@ impl Candidate {
         let moved = self.target_from_source.error_to(&before.target_from_source);
         moved.rotation_degrees < 0.1 && moved.translation < 0.1 * voxel
     }
+}
+
+/// The matches of depth maps alone, of the reference's and of the source's views.
+fn depth_map_matches(sets: &CorrespondenceSets) -> [&[Correspondence]; 2] {
+    let of = |name| sets.of(name).map_or(&[][..], |set| &set.pairs);
+    [of(SetName::DiffusionReference), of(SetName::DiffusionSource)]
 }
 
 /// Step 8: transforms proposed by the sets, the paper's aggregate first.
@@ -123,7 +128,8 @@ fn by_consensus(scale: &Scale, sets: &CorrespondenceSets) -> Vec<RigidTransform>
         .collect()
 }
 
-fn keep_best_scored(pairs: &mut Vec<Correspondence>, count: usize) {
+/// At most `count` pairs, those with the highest scores first; of equals the earlier.
+pub(super) fn keep_best_scored(pairs: &mut Vec<Correspondence>, count: usize) {
     pairs.sort_by(|a, b| b.score.total_cmp(&a.score));
     pairs.truncate(count);
 }
@@ -228,13 +234,7 @@ pub(super) fn finish(
         anchor_weight: (ANCHOR_WEIGHT / (overlap * overlap)).min(MOST_ANCHOR_WEIGHT),
         ..AnchoredIcp::for_voxel(pair.scale.voxel)
     };
-    let views = [SetName::DiffusionReference, SetName::DiffusionSource];
-    let anchors: Vec<Correspondence> = views
-        .iter()
-        .filter_map(|&name| sets.of(name))
-        .flat_map(|set| &set.pairs)
-        .copied()
-        .collect();
+    let anchors = depth_map_matches(sets).concat();
     let (source, target) = (&pair.source.surface, &pair.target.surface);
     let start = &best.target_from_source;
     let Ok(aligned) = icp.align(source, target, &sample(source), &sample(target), &anchors, start)

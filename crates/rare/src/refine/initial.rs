@@ -14,7 +14,7 @@ use crate::verify::Verifier;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum InitialMethod {
-    /// SC2-PCR (second-order spatial compatibility): several hypotheses, the most depth-consistent one wins.
+    /// SC2-PCR (second-order spatial compatibility): several hypotheses, the most believable one wins.
     #[default]
     Sc2Pcr,
     /// RANSAC with three-point samples.
@@ -22,13 +22,13 @@ pub enum InitialMethod {
     /// SC2-PCR++: the poses of SC2-PCR, chosen among by features and space together.
     #[serde(rename = "sc2-pcr++")]
     Sc2PcrPlusPlus,
-    /// MAC (maximal cliques): several hypotheses, the most depth-consistent one wins.
+    /// MAC (maximal cliques): several hypotheses, the most believable one wins.
     Mac,
     /// MAC on a sample that keeps half of the matches.
     FastMac,
 }
 
-/// SC2-PCR's distinct hypotheses that are compared by depth consistency.
+/// SC2-PCR's distinct hypotheses that are compared by their evidence.
 const HYPOTHESES: usize = 10;
 
 /// Matches fast point feature histograms and looks for the pose on which most matches agree; working frames.

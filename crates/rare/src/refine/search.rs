@@ -7,6 +7,7 @@ use crate::error::Result;
 use crate::matching::{correspondences, nearest};
 use crate::pose::Sc2Pcr;
 use crate::random::Random;
+use crate::refine::hypotheses::keep_best_scored;
 use crate::refine::working_pair::{WorkingCloud, WorkingPair};
 
 /// Matches in which consensus is sought.
@@ -104,8 +105,7 @@ fn putative_of(pair: &WorkingPair<'_>, kind: Kind) -> Result<Vec<Correspondence>
 
 fn best_matches(source: &PointFeatures, target: &PointFeatures) -> Result<Vec<Correspondence>> {
     let mut pairs = correspondences(source, target, &nearest(source, target, None)?, 1);
-    pairs.sort_by(|a, b| b.score.total_cmp(&a.score));
-    pairs.truncate(MATCHES);
+    keep_best_scored(&mut pairs, MATCHES);
     Ok(pairs)
 }
 
