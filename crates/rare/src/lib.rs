@@ -49,4 +49,7 @@ pub use data::{
 };
 pub use error::{Error, Result};
 pub use nalgebra;
-pub use refine::{EncodedViews, InitialMethod, Recipe, Refinement, Refiner, RefinerConfig};
+pub use refine::{
+    EncodedViews, Hypothesis, InitialMethod, Recipe, Refinement, Refiner, RefinerConfig,
+    SetEvidence,
+};

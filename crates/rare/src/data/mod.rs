@@ -24,5 +24,5 @@ pub use point_features::PointFeatures;
 pub(crate) use point_features::normalise;
 pub use scan::Scan;
 pub use transform::{PoseError, RigidTransform};
-pub(crate) use voxel_grid::{Cell, CellHasher, VoxelGrid};
+pub(crate) use voxel_grid::{Cell, CellHasher, VoxelGrid, first_of_every_voxel};
 pub use voxel_grid::{resolution, voxel_downsample};

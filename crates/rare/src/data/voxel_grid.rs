@@ -1,6 +1,6 @@
 //! Thinning clouds: one centroid per occupied voxel, and how dense a cloud is.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::hash::{BuildHasherDefault, Hasher};
 
 use nalgebra::{Point3, Vector3};
@@ -40,6 +40,18 @@ pub fn voxel_downsample(points: &[Point3<f64>], voxel: f64) -> Result<Vec<Point3
         }
     }
     Ok(sums.into_iter().map(|(sum, count)| Point3::from(sum / count)).collect())
+}
+
+/// The first point in every occupied voxel (edge `voxel`, metres): their indices, ascending. The grid is that of
+/// [`voxel_downsample`].
+///
+/// # Errors
+/// As [`voxel_downsample`].
+pub(crate) fn first_of_every_voxel(points: &[Point3<f64>], voxel: f64) -> Result<Vec<usize>> {
+    let grid = VoxelGrid::over(points, voxel)?;
+    let mut occupied = HashSet::<Cell, BuildHasherDefault<CellHasher>>::default();
+    let first = points.iter().enumerate().filter(|(_, point)| occupied.insert(grid.cell(point)));
+    Ok(first.map(|(index, _)| index).collect())
 }
 
 /// The median distance of a point to its nearest neighbour, metres, over a fixed sample of 1000 points.
@@ -180,6 +192,15 @@ mod tests {
                 prop_assert!((centroid.coords - sum / members.len() as f64).norm() < 1e-9);
             }
         }
+    }
+
+    #[test]
+    fn the_first_point_of_a_voxel_stands_for_it() {
+        let points = [0.9, 0.0, 1.6, 0.2, 1.4, 2.6].map(|x| Point3::new(x, 0.0, 0.0));
+        // Voxels begin half a voxel below the lowest point: at -0.5, 0.5, 1.5 and 2.5.
+        assert_eq!(first_of_every_voxel(&points, 1.0).unwrap(), [0, 1, 2, 5]);
+        assert!(first_of_every_voxel(&[], 1.0).unwrap().is_empty());
+        assert!(first_of_every_voxel(&points, 0.0).is_err());
     }
 
     #[test]

@@ -4,7 +4,9 @@ use nalgebra::Point3;
 use rayon::prelude::*;
 
 use crate::aggregate::{Aggregation, aggregate, aggregate_candidates};
-use crate::data::{Correspondence, CorrespondenceSets, RigidTransform, SetName};
+use crate::data::{
+    Correspondence, CorrespondenceSets, RigidTransform, SetName, first_of_every_voxel,
+};
 use crate::error::Result;
 use crate::pose::{AnchoredIcp, Icp, IcpStage, IcpTarget, RobustKernel, Sc2Pcr, fit_weighted};
 use crate::refine::Recipe;
@@ -29,8 +31,13 @@ const HYPOTHESES_PER_SET: usize = 2;
 const MOST_PAIRS: usize = 1000;
 /// Points that are moved onto the surface when many candidates are polished.
 const ROUGH_POINTS: usize = 700;
-/// Points of each surface in the final alignment.
-const FINE_POINTS: usize = 5000;
+/// The final alignment takes one point of each surface from every voxel of these sizes (in voxels): of the first size
+/// that leaves enough, ...
+const FINE_SPACINGS: [f64; 2] = [2.0, 1.0];
+/// ... which are so many, ...
+const ENOUGH_FINE_POINTS: usize = 1000;
+/// ... and never more than these.
+const MOST_FINE_POINTS: usize = 5000;
 /// Weight of all matches in the final alignment, relative to that of all surface pairs, where everything overlaps; it
 /// grows with the inverse square of the overlap, because the less overlaps, the less of the surfaces' disagreement is
 /// noise that averages out, ...
@@ -237,7 +244,8 @@ pub(super) fn finish(
     let anchors = depth_map_matches(sets).concat();
     let (source, target) = (&pair.source.surface, &pair.target.surface);
     let start = &best.target_from_source;
-    let Ok(aligned) = icp.align(source, target, &sample(source), &sample(target), &anchors, start)
+    let spread = |surface| evenly_spread(surface, pair.scale.voxel);
+    let Ok(aligned) = icp.align(source, target, &spread(source), &spread(target), &anchors, start)
     else {
         return *best;
     };
@@ -246,10 +254,16 @@ pub(super) fn finish(
     if finished.score() >= best.score() - TOLERATED { finished } else { *best }
 }
 
-/// Evenly spread points of a surface.
-fn sample(surface: &IcpTarget) -> Vec<usize> {
-    let count = surface.points().len();
-    (0..count).step_by(count.div_ceil(FINE_POINTS).max(1)).collect()
+/// Points that are spread evenly over a surface. What is near a sensor is seen in more points than what is far, and
+/// would drown what only the far points know: the rotation.
+fn evenly_spread(surface: &IcpTarget, voxel: f64) -> Vec<usize> {
+    let points = surface.points();
+    let spaced =
+        FINE_SPACINGS.iter().filter_map(|size| first_of_every_voxel(points, size * voxel).ok());
+    let enough = spaced.into_iter().find(|chosen| chosen.len() >= ENOUGH_FINE_POINTS);
+    let chosen = enough.unwrap_or_else(|| (0..points.len()).collect());
+    let step = chosen.len().div_ceil(MOST_FINE_POINTS).max(1);
+    chosen.into_iter().step_by(step).collect()
 }
 
 /// Tukey point-to-plane within a few voxels, coarse to fine, until steps are shorter than `tolerance` voxels.

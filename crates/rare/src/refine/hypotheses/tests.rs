@@ -231,6 +231,28 @@ fn a_screening_brings_poses_onto_the_surface_and_says_where_they_are_from() {
 }
 
 #[test]
+fn near_and_far_points_are_taken_alike() {
+    // A floor, ten times as dense on one half.
+    let floor = |spacing: f64, from: f64| {
+        let steps = (2.0 / spacing) as u32;
+        (0..steps * steps).map(move |i| {
+            let (x, y) = (f64::from(i % steps), f64::from(i / steps));
+            Point3::new(from + x * spacing, y * spacing, 0.0)
+        })
+    };
+    let dense: Vec<Point3<f64>> = floor(0.01, 0.0).collect();
+    let points: Vec<Point3<f64>> = dense.iter().copied().chain(floor(0.033, 2.0)).collect();
+    let surface = IcpTarget::with_estimated_normals(points, 10).unwrap();
+    let chosen = evenly_spread(&surface, VOXEL);
+    let near = chosen.iter().filter(|&&index| index < dense.len()).count();
+    let far = chosen.len() - near;
+    assert!((chosen.len() > ENOUGH_FINE_POINTS) && near.abs_diff(far) < near / 5, "{near} {far}");
+    // Of a small surface everything is taken, of none nothing is wanted.
+    let small = IcpTarget::with_estimated_normals(dense[..150].to_vec(), 10).unwrap();
+    assert_eq!(evenly_spread(&small, VOXEL), (0..150).collect::<Vec<_>>());
+}
+
+#[test]
 fn the_winner_is_finished_unless_that_does_harm() {
     let room = Room::new();
     room.with(|pair, verifier| {
