@@ -15,7 +15,7 @@ if [ $# -lt 3 ] || [ $# -gt 4 ]; then
     echo "usage: run.sh DATA HARNESS OUT [peers|rare]" >&2
     exit 2
 fi
-data=$1 harness=$2 out=$3 which=${4:-both}
+data=$1 harness=$2 out=$3 which=${4:-both} here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 rare=${RARE:-target/release/rare} python=${PYTHON:-python3} options=${RARE_OPTIONS:-}
 peers=init,p2p,p2l,tukey,multi,gicp,sgicp,svgicp
 
@@ -29,16 +29,6 @@ mkdir -p "$out/peers" "$out/rare"
 # What the harness needs to know of scans that are not indoors.
 scale_of() {
     case $1 in lidar* | street*) echo "--voxel 0.3 --scale 10 --success 5,0.6" ;; esac
-}
-
-# Whether the starts $2 have every pair of the list $1; the harness takes the identity for those that are missing.
-covers() {
-    "$python" - "$1" "$2" <<'EOF'
-import json, sys
-pairs, starts = (json.load(open(path)) for path in sys.argv[1:])
-have = {(pair["src"], pair["ref"]) for pair in starts["pairs"]}
-sys.exit(not all((pair["src"], pair["ref"]) in have for pair in pairs))
-EOF
 }
 
 # one RESULT FOLDER LIST STARTS METHODS...: a run of the harness, if there is no result yet.
@@ -56,7 +46,8 @@ one() {
 find "$data" -name 'pairs*.json' | sort | while read -r path; do
     folder=$(dirname "$path") list=$(basename "$path")
     for starts in "$folder"/init_*.json; do
-        [ -e "$starts" ] && covers "$path" "$starts" || continue
+        # The harness takes the identity for starts that are missing.
+        "$python" "$here/covers.py" "$path" "$starts" || continue
         start=$(basename "$starts" .json)
         name=$(basename "$folder").${list%.json}.${start#init_}.json
         if [ "$which" != rare ]; then

@@ -7,7 +7,7 @@
 
 A folder of results is read with all folders below it. The model is `confidence = 1 / (1 + exp(-(intercept + sum
 coefficient * signal)))`, fitted by ridge logistic regression; every pair of clouds has the same total weight, however
-many starts it has. It is printed as constants of Rust. Then every folder of --leave-out is predicted by a model that was
+many starts it has; coefficients whose sign contradicts their signal are left out. It is printed as a constant of Rust. Then every folder of --leave-out is predicted by a model that was
 fitted without it, and the predictions of all of them are scored together; other folders (simulated ones) are always in
 the training set. A result without a pose or a confidence counts as confidence 0 and is not fitted.
 
@@ -61,7 +61,9 @@ def names_of_signals(rows):
     silent = next((row for row in rows if row.confidence is not None and not row.signals), None)
     if silent:
         raise SystemExit(f"{silent.folder}, pair {silent.pair}: no signals to fit: evaluate again, or use --as-reported")
-    names = sorted({name for row in rows if has_signals(row) for name in row.signals})
+    found = {name for row in rows if has_signals(row) for name in row.signals}
+    known = list(logistic.SIGNS)
+    names = sorted(found, key=lambda name: (known.index(name) if name in known else len(known), name))
     for row in filter(has_signals, rows):
         lacking = [name for name in names if row.signals.get(name) is None]
         if lacking:
@@ -84,7 +86,8 @@ def fit(rows, names, penalty):
     keys = [row.key for row in rows]
     count = Counter(keys)
     weights = np.array([1 / count[key] for key in keys])
-    return logistic.fit(values_of(rows, names), right, weights, penalty)
+    signs = [logistic.SIGNS.get(name, 0) for name in names]
+    return logistic.fit_signed(values_of(rows, names), right, weights, penalty, signs)
 
 
 def predict(model, rows, names):
@@ -98,20 +101,12 @@ def reported(rows):
     return np.array([row.confidence or 0.0 for row in rows])
 
 
-def constants(model, names):
-    """The model in Rust, with six digits."""
-    number = lambda value: repr(float(f"{value:.6g}"))  # noqa: E731
-    pairs = "".join(f'    ("{name}", {number(value)}),\n' for name, value in zip(names, model.coefficients))
-    return (f"const INTERCEPT: f64 = {number(model.intercept)};\n"
-            f"const COEFFICIENTS: [(&str, f64); {len(names)}] = [\n{pairs}];")
-
-
 def refitted(rows, held, folders, arguments):
     """(name, rows, confidences) of everything to be scored, by models that did not see it unless the name says so."""
     names = names_of_signals(rows + held)
     model = fit(rows, names, arguments.penalty)
     print(f"fitted on {len({row.key for row in rows})} pairs, {sum(map(has_signals, rows))} results, "
-          f"penalty {arguments.penalty:g}\n\n{constants(model, names)}\n")
+          f"penalty {arguments.penalty:g}\n\n{model.rust('CONFIDENCE')}\n// {', '.join(names)}\n")
     parts = []
     for folder in folders:
         unseen = [row for row in rows if row.folder == folder]
@@ -204,11 +199,21 @@ def check_fit():
     few, many = simulated(2, 300, ["a"]), simulated(2, 300, ["a"])
     first = [row for row in many if row.pair == (0, 0)]
     assert np.allclose(fit(few, names, 1.0).coefficients, fit(many + first, names, 1.0).coefficients)
+    # A sign that contradicts the signal is not believed, and the others are fitted without it.
+    signs = [1, 1, 0]
+    signed = logistic.fit_signed(values_of(rows, names), *target_of(rows), 1.0, signs)
+    assert signed.coefficients[1] == 0.0 and 0.5 < signed.coefficients[0] < 2.0, signed
+    assert logistic.Model(-1.0, np.array([-0.001, 2.0])).rust("X").endswith(
+        "Model { intercept: -1.00, coefficients: [0.00, 2.00] };")
     # What separates perfectly still has a finite fit, and errors are left alone.
     clear = [Row("a", (n, 0), n, n > 5, 0.5, {"x": float(n)}) for n in range(12)]
     failed = Row("a", (99, 0), 99, False, None, None)
     assert np.isfinite(fit(clear + [failed], ["x"], 1.0).coefficients).all()
     assert predict(fit(clear, ["x"], 1.0), [failed, clear[-1]], ["x"])[0] == 0.0
+
+
+def target_of(rows):
+    return np.array([row.right for row in rows]), np.ones(len(rows))
 
 
 def check_figures():
@@ -238,8 +243,6 @@ def check_split():
     rows = simulated(3, 600, ["frag50", "frag20", "scan1", "rooms"])
     held = [row for row in rows if is_held_out(row)]
     assert held and all(row.folder == "scan1" for row in held)
-    assert constants(logistic.Model(-1.0, np.array([1e-7, 2.0])), ["a", "b"]).split("\n")[2:4] == [
-        '    ("a", 1e-07),', '    ("b", 2.0),']
     options = argparse.Namespace(penalty=1.0)
     parts = {name: own for name, _, own in refitted(rows, [], ["frag50", "scan1"], options)}
     assert list(parts) == ["frag50", "scan1", f"frag20 ({FITTED})", f"rooms ({FITTED})"]

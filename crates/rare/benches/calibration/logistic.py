@@ -3,6 +3,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+# The signals of `Evidence::signals`, in its order, and whether more of each speaks for a pose or against it. Where a fit
+# says the opposite, it has learned an accident of its data.
+SIGNS = {"agreement": 1, "occlusion": -1, "gross_violations": -1, "normal_agreement": 1, "correlation": 1, "support": 1,
+         "log_weaker_support": 1}
 ROUNDS = 200
 TOLERANCE = 1e-10
 
@@ -13,6 +17,12 @@ class Model:
 
     intercept: float
     coefficients: np.ndarray
+
+    def rust(self, name):
+        """The model as a constant of `Model`."""
+        coefficients = ", ".join(f"{value:.2f}".replace("-0.00", "0.00") for value in self.coefficients)
+        return (f"pub const {name}: Model =\n"
+                f"    Model {{ intercept: {self.intercept:.2f}, coefficients: [{coefficients}] }};")
 
     def probability(self, signals):
         return logistic(self.intercept + signals @ self.coefficients)
@@ -38,6 +48,18 @@ def fit(signals, right, weights, penalty):
     standard = newton(design, right.astype(float), weights, ridge)
     coefficients = standard[1:] / spread
     return Model(float(standard[0] - coefficients @ mean), coefficients)
+
+
+def fit_signed(signals, right, weights, penalty, signs):
+    """The same with coefficients of the given signs (1, -1, or 0 for either): of those that come out with the other sign
+    the weightiest is left out, until there is none."""
+    free = np.ones(signals.shape[1], bool)
+    while True:
+        model = fit(np.where(free, signals, 0.0), right, weights, penalty)
+        against = -np.asarray(signs) * model.coefficients * signals.std(axis=0)
+        if against.max(initial=0.0) <= 0.0:
+            return model
+        free[against.argmax()] = False
 
 
 def newton(design, right, weights, ridge):
