@@ -3,8 +3,8 @@
 //!
 //! `cargo run --release --example compared_poses -- FOLDER PAIRS.json STARTS.json EVERY FIRST > poses.jsonl`
 //!
-//! FOLDER is one of `rare eval folder`, PAIRS.json and STARTS.json lie in it. Of its pairs every EVERYth is taken,
-//! beginning with the FIRSTth (1 and 0 take all).
+//! FOLDER is one of `rare eval folder`, PAIRS.json and STARTS.json lie in it. Of its pairs one in EVERY is taken,
+//! beginning with number FIRST (1 and 0 take all).
 #![expect(
     clippy::print_stderr,
     reason = "says what is wrong with the arguments, and how far it has come"

@@ -10,6 +10,7 @@ Files of one folder, list of pairs and set of starts are put together, so that p
 import argparse
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -70,6 +71,27 @@ def overview_row(group):
         str(sum(a.rmse < RMSE <= b.rmse for a, b in zip(start, ours))))
     cpu = [result.cpu for result in ours]
     return [group.name, *cells, str(solved(ours)), mean_errors(scores_of(ours)), lost, lost_rmse,
+            f"{np.median(cpu):.2f}", f"{np.percentile(cpu, 95):.2f}"]
+
+
+def pooled(groups):
+    """Ours over all starts: a row for each list of pairs, and one for everything."""
+    lists = list(dict.fromkeys((group.folder, group.pairs) for group in groups))
+    own = lambda one: [group for group in groups if (group.folder, group.pairs) == one]  # noqa: E731
+    rows = [pooled_row(f"{folder} | {Path(pairs).stem}", own((folder, pairs))) for folder, pairs in lists]
+    headings = ["folder", "pairs", "starts", "results", "solved", "%", "RE deg / TE cm", "lost", "lost by RMSE",
+                "median cpu s", "p95 cpu s"]
+    return table(headings, [*rows, pooled_row("all | all", groups)])
+
+
+def pooled_row(name, groups):
+    ours = [result for group in groups for result in group.results[OURS]]
+    pairs = [(start, own) for group in groups if START in group.results
+             for start, own in zip(group.results[START], group.results[OURS])]
+    cpu = [result.cpu for result in ours]
+    return [name, str(len(groups)), str(len(ours)), str(solved(ours)), f"{100 * solved(ours) / len(ours):.1f}",
+            mean_errors(scores_of(ours)), str(sum(start.right and not own.right for start, own in pairs)),
+            str(sum(start.rmse < RMSE <= own.rmse for start, own in pairs)),
             f"{np.median(cpu):.2f}", f"{np.percentile(cpu, 95):.2f}"]
 
 
@@ -148,6 +170,7 @@ def report(groups, data, success):
     ours = [group for group in groups if OURS in group.results]
     high, low = ([group for group in ours if group.is_low_overlap == is_low] for is_low in (False, True))
     parts = [("All starts", overview(groups))]
+    parts += [("Over all starts", pooled(ours))] if ours else []
     refined = lambda some: compared_by_refined(some, data, success) if data else []  # noqa: E731
     by_truth = [("gt", compared_by_file(high)), (REFINED, refined(high))]
     parts += [(f"More than 30 % overlap: RE and TE of ours over those of each peer, pairs that both solve, against "
@@ -188,6 +211,7 @@ def self_check():
                      OURS: [(2, 0.1), (20, 0.4), (1, 0.2), (1, 0.05)]})
     row = overview_row(group)
     assert row == ["frag50 | pairs | kiss", "4", "2", "2 (gicp)", "3", "1.33 / 11.67", "1", "1", "2.50", "3.85"], row
+    assert pooled_row("a", [group, group]) == ["a", "2", "8", "6", "75.0", "1.33 / 11.67", "2", "2", "2.50", "4.00"]
     assert ratios(*(scores_of(group.results[name]) for name in (OURS, "p2l"))) == (2.0, 1.0, 1)
     degrees, metres, count = ratios(*(scores_of(group.results[name]) for name in (OURS, "gicp")))
     assert abs(degrees - 3 / 5) < 1e-12 and abs(metres - 1.0) < 1e-12 and count == 2

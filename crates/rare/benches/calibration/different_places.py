@@ -4,7 +4,7 @@
     different_places.py OUT PLACE=CLOUD,CLOUD... PLACE=CLOUD,CLOUD... [...]
 
 Clouds are .ply files (copied) and .npz files (`src` and `ref`, both become clouds); clouds of one place are never paired.
-Of all pairs of clouds of different places every third is taken. Their truth is a kilometre away, where no pose is right.
+All pairs of clouds of different places are taken, either way round. Their truth is a kilometre away, where no pose is right.
 """
 import json
 import shutil
@@ -46,9 +46,8 @@ def main():
             place_of += [name] * copy_clouds(Path(file), out, len(place_of))
     numbers = range(len(place_of))
     apart = [(source, reference) for source in numbers for reference in numbers if place_of[source] != place_of[reference]]
-    chosen = apart[::3]
-    (out / "pairs.json").write_text(json.dumps([{"src": source, "ref": reference, "gt": NOWHERE} for source, reference in chosen]))
-    starts = [{"src": source, "ref": reference, "init": IDENTITY} for source, reference in chosen]
+    (out / "pairs.json").write_text(json.dumps([{"src": source, "ref": reference, "gt": NOWHERE} for source, reference in apart]))
+    starts = [{"src": source, "ref": reference, "init": IDENTITY} for source, reference in apart]
     (out / "init_identity.json").write_text(json.dumps({"pairs": starts}))
 
 

@@ -58,7 +58,9 @@ cloud() { echo "$scenes/$1/cloud_bin_$2.ply"; }
 [ -d "$scenes/different-objects" ] || "$python" "$here/different_places.py" "$scenes/different-objects" \
     "a=$(cloud objects 0),$(cloud objects 1)" "b=$(cloud objects 2),$(cloud objects 3)" "c=$(cloud objects 4)"
 for folder in "$scenes"/*; do
+    # No sensor stood at the origin of an object's scan.
+    case $folder in *objects) options=(--profile object) ;; *) options=() ;; esac
     for starts in "$folder"/init_*.json; do
-        evaluate "$folder" pairs "$starts"
+        evaluate "$folder" pairs "$starts" "${options[@]}"
     done
 done

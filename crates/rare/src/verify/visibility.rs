@@ -49,10 +49,12 @@ impl DepthConsistency {
         share(self.occluded, self.agree + self.violation + self.occluded)
     }
 
-    /// Share of the comparable points (agreeing or violating) that violate grossly; 0 where there is none.
+    /// Share of the comparable points (agreeing or violating) that violate grossly; 1 where there is none: a pose under
+    /// which the sensors see nothing in common has nothing to say for itself.
     #[must_use]
     pub fn gross_share(&self) -> f64 {
-        share(self.gross_violation, self.agree + self.violation)
+        let comparable = self.agree + self.violation;
+        if comparable == 0 { 1.0 } else { share(self.gross_violation, comparable) }
     }
 
     fn add(self, other: DepthConsistency) -> DepthConsistency {
@@ -320,6 +322,6 @@ mod tests {
         assert_eq!(sum, expected);
         let nothing = DepthConsistency::default();
         let shares = [nothing.agreement(), nothing.occlusion(), nothing.gross_share()];
-        assert_eq!(shares, [0.0; 3]);
+        assert_eq!(shares, [0.0, 0.0, 1.0]);
     }
 }
