@@ -4,7 +4,7 @@
     ablation.py OUT [--success 'objects*=15,0.025']
 
 A line is a variant on one list of pairs of one folder, over all its starts: solved results of all, results that were
-solved by the start and are not any more, mean errors over those that every variant solves, median wall time. Needs numpy.
+solved by the start and are not any more, and mean errors over those that every variant solves. Needs numpy.
 """
 import argparse
 import json
@@ -21,7 +21,7 @@ METHOD, START = "refine", "init"
 
 
 def read(folder, success):
-    """{(start, pair): (solved, solved by the start, degrees, metres, seconds)} of one folder of results."""
+    """{(start, pair): (solved, solved by the start, degrees, metres)} of one folder of results."""
     benchmark = json.loads((folder / "benchmark.json").read_text())
     found = {}
     for line in (folder / "results.jsonl").read_text().splitlines():
@@ -29,7 +29,7 @@ def read(folder, success):
         pose = result.get("target_from_source")
         truth = np.array(benchmark["pairs"][result["pair"]]["target_from_source"], float)
         errors = scoring.errors(None if pose is None else np.array(pose, float), truth)
-        found[result["method"], result["pair"]] = (success.holds(benchmark["name"], *errors), *errors, result["seconds"])
+        found[result["method"], result["pair"]] = (success.holds(benchmark["name"], *errors), *errors)
     start = folder.name.rsplit(".", 1)[1]
     of_start = lambda pair: found[START, pair][0]  # noqa: E731
     return {(start, pair): (solved, of_start(pair), *rest)
@@ -55,14 +55,13 @@ def rows(variants):
             solved = sum(result[0] for result in results.values())
             lost = sum(result[1] and not result[0] for result in results.values())
             degrees, metres = np.mean([results[key][2:4] for key in common], axis=0) if common else (np.nan, np.nan)
-            seconds = np.median([result[4] for result in results.values()])
             folder, pairs = group.rsplit(".", 1)
             yield [folder, pairs, name, f"{solved} of {len(results)}", str(lost),
-                   f"{degrees:.2f} / {100 * metres:.2f} ({len(common)})", f"{seconds:.2f}"]
+                   f"{degrees:.2f} / {100 * metres:.2f} ({len(common)})"]
 
 
 def table(lines):
-    head = ["folder", "pairs", "variant", "solved", "lost", "RE deg / TE cm (where all solve)", "median s"]
+    head = ["folder", "pairs", "variant", "solved", "lost", "RE deg / TE cm (where all solve)"]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, ["---"] * len(head), *lines])
 
 
@@ -86,7 +85,7 @@ def self_check():
     pose = lambda metres: [[1, 0, 0, metres], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]  # noqa: E731
     pairs = [{"target_from_source": pose(1.0)}, {"target_from_source": pose(2.0)}]
     line = lambda pair, method, metres: json.dumps(  # noqa: E731
-        {"pair": pair, "method": method, "target_from_source": pose(metres), "seconds": 0.5}) + "\n"
+        {"pair": pair, "method": method, "target_from_source": pose(metres)}) + "\n"
     with tempfile.TemporaryDirectory() as name:
         for variant, first in (("everything", 1.1), ("no-polish", 1.4)):
             folder = Path(name) / variant / "frag50.pairs.init_a"
@@ -96,8 +95,8 @@ def self_check():
                 line(0, "init", 1.0) + line(0, "refine", first) + line(1, "init", 9.0) + line(1, "refine", 2.2))
         variants = {path.name: read_variant(path, scoring.Success()) for path in Path(name).iterdir()}
     found = list(rows(variants))
-    assert found == [["frag50", "pairs", "everything", "2 of 2", "0", "0.00 / 20.00 (1)", "0.50"],
-                     ["frag50", "pairs", "no-polish", "1 of 2", "1", "0.00 / 20.00 (1)", "0.50"]], found
+    assert found == [["frag50", "pairs", "everything", "2 of 2", "0", "0.00 / 20.00 (1)"],
+                     ["frag50", "pairs", "no-polish", "1 of 2", "1", "0.00 / 20.00 (1)"]], found
     print("self-check passed", file=sys.stderr)
 
 

@@ -33,7 +33,7 @@ variant() {
                 result=$out/$name/$(basename "$folder").$(basename "$list" .json).$(basename "$starts" .json)
                 mkdir -p "$(dirname "$result")"
                 "$rare" eval folder "$folder" --pairs "$(basename "$list")" --init "$starts" --methods init,refine \
-                    --jobs "$(nproc)" "$@" --output "$result" >/dev/null </dev/null
+                    "$@" --output "$result" >/dev/null </dev/null
             done
         done
     done

@@ -43,7 +43,7 @@ one() {
     mv "$result.part" "$result"
 }
 
-find "$data" -name 'pairs*.json' | sort | while read -r path; do
+find -L "$data" -name 'pairs*.json' | sort | while read -r path; do
     folder=$(dirname "$path") list=$(basename "$path")
     for starts in "$folder"/init_*.json; do
         # The harness takes the identity for starts that are missing.

@@ -5,8 +5,8 @@
 #
 # DATA     folder with benchmark folders at any depth (cloud_bin_N.ply, pairs*.json, init_*.json), among them
 #          redkitchen-dev/frag50, redkitchen-dev/scan1 and lidar-dev, and with pairs/regtr_hotel_um_8_15.npz
-# OUT      OUT/scenes: simulated benchmarks and scans of different places; OUT/results/FOLDER.PAIRS.START: the results.
-#          What was begun goes on where it was interrupted.
+# OUT      OUT/scenes: simulated benchmarks and scans of different places; OUT/results/FOLDER.PAIRS.START: the results;
+#          OUT/objects: those of objects, which are only scored. What was begun goes on where it was interrupted.
 #
 # RARE (target/release/rare), SIMULATE (target/release/examples/synthetic_benchmark) and PYTHON (python3) may be set.
 set -euo pipefail
@@ -25,18 +25,18 @@ for program in "$rare" "$simulate"; do
 done
 mkdir -p "$out/scenes" "$out/results"
 
-# evaluate FOLDER LIST STARTS OPTIONS...: results of one set of starts.
+# evaluate WHERE FOLDER LIST STARTS OPTIONS...: results of one set of starts.
 evaluate() {
-    local folder=$1 list=$2 starts=$3
-    shift 3
+    local where=$1 folder=$2 list=$3 starts=$4
+    shift 4
     "$rare" eval folder "$folder" --pairs "$list.json" --init "$starts" --methods refine --jobs "$(nproc)" "$@" \
-        --output "$out/results/$(basename "$folder").$list.$(basename "$starts" .json)" >/dev/null </dev/null
+        --output "$out/$where/$(basename "$folder").$list.$(basename "$starts" .json)" >/dev/null </dev/null
 }
 
-find "$data" -name 'pairs*.json' | sort | while read -r path; do
+find -L "$data" -name 'pairs*.json' | sort | while read -r path; do
     for starts in "$(dirname "$path")"/init_*.json; do
         "$python" "$here/../accuracy/covers.py" "$path" "$starts" || continue
-        evaluate "$(dirname "$path")" "$(basename "$path" .json)" "$starts"
+        evaluate results "$(dirname "$path")" "$(basename "$path" .json)" "$starts"
     done
 done
 
@@ -59,8 +59,11 @@ cloud() { echo "$scenes/$1/cloud_bin_$2.ply"; }
     "a=$(cloud objects 0),$(cloud objects 1)" "b=$(cloud objects 2),$(cloud objects 3)" "c=$(cloud objects 4)"
 for folder in "$scenes"/*; do
     # No sensor stood at the origin of an object's scan.
-    case $folder in *objects) options=(--profile object) ;; *) options=() ;; esac
+    case $folder in
+        *objects) where=objects options=(--profile object) ;;
+        *) where=results options=() ;;
+    esac
     for starts in "$folder"/init_*.json; do
-        evaluate "$folder" pairs "$starts" "${options[@]}"
+        evaluate "$where" "$folder" pairs "$starts" "${options[@]}"
     done
 done

@@ -79,7 +79,7 @@ impl Model {
     /// Whether the best pose of a pair is right, which may have nothing in common: the confidence that is reported. It is
     /// a model of its own, because a search finds the most deceptive of all poses.
     pub const CONFIDENCE: Model =
-        Model { intercept: -16.54, coefficients: [10.03, -2.13, -9.62, 2.71, 0.17, 3.30, 0.91] };
+        Model { intercept: -30.42, coefficients: [27.94, -3.68, -37.55, 1.04, 0.0, 3.95, 0.72] };
 
     /// The model that ranks poses of which so much is known.
     #[must_use]
