@@ -308,7 +308,7 @@ impl Refiner {
         let matches = pair.to_world_sets(sets);
         let sets: Vec<SetEvidence> = sets.sets.iter().map(of_set).collect();
         let overlap = pair.overlap(pose);
-        let confidence = Model::CONFIDENCE.probability(&candidate.evidence);
+        let confidence = Model::confidence(pair.scale.kind).probability(&candidate.evidence);
         Refinement {
             target_from_source: pair.to_world(pose),
             verdict: Verdict::of(confidence, pose == initial),

@@ -6,7 +6,7 @@
 # DATA     folder with benchmark folders at any depth (cloud_bin_N.ply, pairs*.json, init_*.json), among them
 #          redkitchen-dev/frag50, redkitchen-dev/scan1 and lidar-dev, and with pairs/regtr_hotel_um_8_15.npz
 # OUT      OUT/scenes: simulated benchmarks and scans of different places; OUT/results/FOLDER.PAIRS.START: the results;
-#          OUT/objects: those of objects, which are only scored. What was begun goes on where it was interrupted.
+#          OUT/objects: those of objects, which have a model of their own. What was begun goes on where it was interrupted.
 #
 # RARE (target/release/rare), SIMULATE (target/release/examples/synthetic_benchmark) and PYTHON (python3) may be set.
 set -euo pipefail

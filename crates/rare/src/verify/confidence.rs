@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::scale::SceneKind;
 use crate::verify::Evidence;
 
 /// What to make of a result.
@@ -81,6 +82,20 @@ impl Model {
     pub const CONFIDENCE: Model =
         Model { intercept: -30.42, coefficients: [27.94, -3.68, -37.55, 1.04, 0.0, 3.95, 0.72] };
 
+    /// The same for scans of objects. The cameras that look at them are made up: what seems to stand in free space may be
+    /// the far side, so that right poses violate it, too.
+    pub const CONFIDENCE_OF_OBJECTS: Model =
+        Model { intercept: -7.08, coefficients: [5.13, -6.51, -6.03, 3.20, 0.01, 4.30, 0.60] };
+
+    /// The model of the confidence for scans of a kind.
+    #[must_use]
+    pub fn confidence(kind: SceneKind) -> Model {
+        match kind {
+            SceneKind::Indoor | SceneKind::Lidar => Model::CONFIDENCE,
+            SceneKind::Object => Model::CONFIDENCE_OF_OBJECTS,
+        }
+    }
+
     /// The model that ranks poses of which so much is known.
     #[must_use]
     pub fn ranking(evidence: &Evidence) -> Model {
@@ -156,9 +171,11 @@ mod tests {
         for (number, improve) in better.into_iter().enumerate() {
             let mut after = before;
             improve(&mut after);
-            for model in [Model::SCREENING, Model::CONFIDENCE] {
-                assert!(model.probability(&after) > model.probability(&before), "{number}");
-            }
+            let gains = |model: Model| model.log_odds(&after) - model.log_odds(&before);
+            assert!(gains(Model::SCREENING) > 0.0, "{number}");
+            // A model may do without a signal, but must not take it for its opposite.
+            let others = [Model::RANKING, Model::CONFIDENCE, Model::CONFIDENCE_OF_OBJECTS];
+            assert!(others.map(gains).into_iter().all(|gain| gain >= 0.0), "{number}");
         }
         for (number, improve) in more_support.into_iter().enumerate() {
             let mut after = before;
@@ -194,8 +211,12 @@ mod tests {
             },
             support: Some(Support { matches: 500, inliers: 500, weaker_inliers: 250 }),
         };
-        assert!(Model::CONFIDENCE.probability(&perfect) > 0.99);
-        assert!(Model::CONFIDENCE.probability(&Evidence::default()) < 0.1);
+        for kind in [SceneKind::Indoor, SceneKind::Lidar, SceneKind::Object] {
+            let model = Model::confidence(kind);
+            assert!(model.probability(&perfect) > 0.99, "{kind:?}");
+            assert!(model.probability(&Evidence::default()) < 0.1, "{kind:?}");
+        }
+        assert_ne!(Model::confidence(SceneKind::Object), Model::confidence(SceneKind::Indoor));
         assert!(Model::SCREENING.probability(&Evidence::default()) < 0.01);
         assert!(Model::RANKING.probability(&Evidence::default()) < 0.01);
     }
