@@ -11,7 +11,7 @@ use crate::error::Result;
 use crate::pose::{AnchoredIcp, Icp, IcpStage, IcpTarget, RobustKernel, Sc2Pcr, fit_weighted};
 use crate::refine::Recipe;
 use crate::refine::working_pair::WorkingPair;
-use crate::scale::Scale;
+use crate::scale::{Scale, SceneKind};
 use crate::verify::{Evidence, Model, Support, Verifier};
 
 /// A transform between the working frames and what is known of it.
@@ -31,12 +31,12 @@ const HYPOTHESES_PER_SET: usize = 2;
 const MOST_PAIRS: usize = 1000;
 /// Points that are moved onto the surface when many candidates are polished.
 const ROUGH_POINTS: usize = 700;
-/// The final alignment takes one point of each surface from every voxel of these sizes (in voxels): of the first size
-/// that leaves enough, ...
+/// Where points are spread evenly for the final alignment, one is taken from every voxel of these sizes (in voxels): of
+/// the first size that leaves enough, ...
 const FINE_SPACINGS: [f64; 2] = [2.0, 1.0];
 /// ... which are so many, ...
 const ENOUGH_FINE_POINTS: usize = 1000;
-/// ... and never more than these.
+/// ... and nowhere more than these.
 const MOST_FINE_POINTS: usize = 5000;
 /// Weight of all matches in the final alignment, relative to that of all surface pairs, where everything overlaps; it
 /// grows with the inverse square of the overlap, because the less overlaps, the less of the surfaces' disagreement is
@@ -244,8 +244,8 @@ pub(super) fn finish(
     let anchors = depth_map_matches(sets).concat();
     let (source, target) = (&pair.source.surface, &pair.target.surface);
     let start = &best.target_from_source;
-    let spread = |surface| evenly_spread(surface, pair.scale.voxel);
-    let Ok(aligned) = icp.align(source, target, &spread(source), &spread(target), &anchors, start)
+    let chosen = |surface| chosen_points(surface, &pair.scale);
+    let Ok(aligned) = icp.align(source, target, &chosen(source), &chosen(target), &anchors, start)
     else {
         return *best;
     };
@@ -254,16 +254,24 @@ pub(super) fn finish(
     if finished.score() >= best.score() - TOLERATED { finished } else { *best }
 }
 
-/// Points that are spread evenly over a surface. What is near a sensor is seen in more points than what is far, and
-/// would drown what only the far points know: the rotation.
-fn evenly_spread(surface: &IcpTarget, voxel: f64) -> Vec<usize> {
+/// The points of a surface by which it is aligned. A rotating scanner sees what is near in many more points than what is
+/// far, which would drown what only far points know, the rotation: there they are spread evenly. Rooms are sampled
+/// evenly as they are.
+fn chosen_points(surface: &IcpTarget, scale: &Scale) -> Vec<usize> {
     let points = surface.points();
-    let spaced =
-        FINE_SPACINGS.iter().filter_map(|size| first_of_every_voxel(points, size * voxel).ok());
-    let enough = spaced.into_iter().find(|chosen| chosen.len() >= ENOUGH_FINE_POINTS);
-    let chosen = enough.unwrap_or_else(|| (0..points.len()).collect());
+    let all = || (0..points.len()).collect();
+    let chosen: Vec<usize> = match scale.kind {
+        SceneKind::Lidar => evenly_spread(points, scale.voxel).unwrap_or_else(all),
+        SceneKind::Indoor | SceneKind::Object => all(),
+    };
     let step = chosen.len().div_ceil(MOST_FINE_POINTS).max(1);
     chosen.into_iter().step_by(step).collect()
+}
+
+/// One point of every voxel, of the largest voxels that leave enough; `None` if none do.
+fn evenly_spread(points: &[Point3<f64>], voxel: f64) -> Option<Vec<usize>> {
+    let spaced = |size: &f64| first_of_every_voxel(points, size * voxel).ok();
+    FINE_SPACINGS.iter().filter_map(spaced).find(|chosen| chosen.len() >= ENOUGH_FINE_POINTS)
 }
 
 /// Tukey point-to-plane within a few voxels, coarse to fine, until steps are shorter than `tolerance` voxels.

@@ -242,14 +242,20 @@ fn near_and_far_points_are_taken_alike() {
     };
     let dense: Vec<Point3<f64>> = floor(0.01, 0.0).collect();
     let points: Vec<Point3<f64>> = dense.iter().copied().chain(floor(0.033, 2.0)).collect();
-    let surface = IcpTarget::with_estimated_normals(points, 10).unwrap();
-    let chosen = evenly_spread(&surface, VOXEL);
+    let chosen = evenly_spread(&points, VOXEL).unwrap();
     let near = chosen.iter().filter(|&&index| index < dense.len()).count();
     let far = chosen.len() - near;
     assert!((chosen.len() > ENOUGH_FINE_POINTS) && near.abs_diff(far) < near / 5, "{near} {far}");
-    // Of a small surface everything is taken, of none nothing is wanted.
+    assert_eq!(evenly_spread(&dense[..150], VOXEL), None);
+    // A scanner's points are spread, a camera's are taken as they come, a small cloud's all.
+    let surface = IcpTarget::with_estimated_normals(points, 10).unwrap();
     let small = IcpTarget::with_estimated_normals(dense[..150].to_vec(), 10).unwrap();
-    assert_eq!(evenly_spread(&small, VOXEL), (0..150).collect::<Vec<_>>());
+    let scale = |kind| Scale { kind, ..Scale::of_paper(SceneKind::Indoor, Some(VOXEL)) };
+    assert_eq!(chosen_points(&surface, &scale(SceneKind::Lidar)), chosen);
+    assert_eq!(chosen_points(&small, &scale(SceneKind::Lidar)), (0..150).collect::<Vec<_>>());
+    let of_camera = chosen_points(&surface, &scale(SceneKind::Indoor));
+    let near = of_camera.iter().filter(|&&index| index < dense.len()).count();
+    assert!(near > 5 * (of_camera.len() - near) && of_camera.len() <= MOST_FINE_POINTS);
 }
 
 #[test]
