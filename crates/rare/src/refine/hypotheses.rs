@@ -44,8 +44,9 @@ const MOST_FINE_POINTS: usize = 5000;
 const ANCHOR_WEIGHT: f64 = 0.007;
 /// ... up to this.
 const MOST_ANCHOR_WEIGHT: f64 = 0.4;
-/// Log-odds that the final alignment may cost: less than what noise makes of the evidence.
-const TOLERATED: f64 = 0.3;
+/// Log-odds that the final alignment may cost. Matches favour the pose under which their maps were rendered, so that a
+/// better pose loses a tenth of its support.
+const TOLERATED: f64 = 0.6;
 /// What descends from the initial transform is believed more by these log-odds: whoever brings a transform has reasons
 /// for it.
 const PRIOR_OF_INITIAL: f64 = 0.4;
