@@ -7,7 +7,7 @@
 # OUT      OUT/FOLDER.PAIRS.START.jsonl; a file that is there is not made again
 #
 # All pairs with low overlap of frag50 and frag20, every third of scan1's, and a third of the pairs with more overlap;
-# the other two thirds of scan1 are seen by no fit. The example must have been built:
+# the other two thirds of scan1 are not seen by these fits. The example must have been built:
 # `cargo build --release --example compared_poses`.
 set -euo pipefail
 

@@ -23,7 +23,7 @@ for program in "$rare" "$simulate"; do
         exit 2
     fi
 done
-mkdir -p "$out/scenes" "$out/results"
+mkdir -p "$out/scenes" "$out/results" "$out/objects"
 
 # evaluate WHERE FOLDER LIST STARTS OPTIONS...: results of one set of starts.
 evaluate() {

@@ -7,7 +7,8 @@
 
 A folder of results is read with all folders below it. The model is `confidence = 1 / (1 + exp(-(intercept + sum
 coefficient * signal)))`, fitted by ridge logistic regression; every pair of clouds has the same total weight, however
-many starts it has; coefficients whose sign contradicts their signal are left out. It is printed as a constant of Rust. Then every folder of --leave-out is predicted by a model that was
+many starts it has, and those of different places have a fixed share of the whole; coefficients whose sign contradicts
+their signal are left out. It is printed as a constant of Rust. Then every folder of --leave-out is predicted by a model that was
 fitted without it, and the predictions of all of them are scored together; other folders (simulated ones) are always in
 the training set. A result without a pose or a confidence counts as confidence 0 and is not fitted.
 
@@ -85,7 +86,7 @@ def values_of(rows, names):
 
 
 def weights_of(rows):
-    """Every pair weighs 1, however many starts it has; but those of different places together no more than their share."""
+    """Every pair weighs 1, however many starts it has; but those of different places have their share of the whole."""
     count = Counter(row.key for row in rows)
     weights = np.array([1 / count[row.key] for row in rows])
     apart = np.array([is_of_different_places(row) for row in rows])
