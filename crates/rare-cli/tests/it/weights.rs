@@ -155,7 +155,7 @@ fn no_room_for_a_file_leaves_a_part_that_is_continued() {
     assert!(workplace.server.requests().iter().any(continued));
 }
 
-/// Ctrl-C in the middle of a file.
+/// Ended by a signal in the middle of a file: as by Ctrl-C, whose signal shells let their background jobs ignore.
 #[cfg(unix)]
 #[test]
 fn an_interrupted_download_is_no_file() {
@@ -169,7 +169,7 @@ fn an_interrupted_download_is_no_file() {
         assert!(child.try_wait().unwrap().is_none(), "the program has ended");
         thread::sleep(Duration::from_millis(10));
     }
-    let interrupted = Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+    let interrupted = Command::new("kill").args(["-TERM", &child.id().to_string()]).status();
     assert!(interrupted.unwrap().success());
     assert!(!child.wait().unwrap().success());
     assert!(!workplace.path("w").join(UNET).exists());
