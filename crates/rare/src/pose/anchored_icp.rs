@@ -21,6 +21,8 @@ use crate::pose::normal_equations::{NormalEquations, OPEN_SHARE, Step};
 use crate::pose::partners::CHUNK;
 use crate::pose::{IcpStage, IcpTarget};
 
+/// How far apart the rings of a rotating scanner may lie, in voxels.
+pub(crate) const RING_REACH: f64 = 6.0;
 /// Damping relative to the mean diagonal of the scaled system: far below what moves a determined direction, far above
 /// the rounding that would move an open one.
 const DAMPING: f64 = 1e-9;
@@ -72,6 +74,19 @@ impl AnchoredIcp {
             translation_tolerance: 0.002 * voxel,
             anchor_weight: 0.1,
             anchor_width: 4.0 * voxel,
+        }
+    }
+
+    /// For scans of a rotating scanner, sampled at `voxel` (metres). Its rings lie metres apart, and so do the points of
+    /// one and the same road: pairs up to six voxels apart, with a Tukey kernel of that width; else like
+    /// [`AnchoredIcp::for_voxel`].
+    #[must_use]
+    pub fn for_rotating_scanner(voxel: f64) -> AnchoredIcp {
+        let reach = RING_REACH * voxel;
+        AnchoredIcp {
+            stages: vec![IcpStage { max_distance: reach, kernel_width: reach }],
+            max_iterations: 30,
+            ..AnchoredIcp::for_voxel(voxel)
         }
     }
 

@@ -18,6 +18,7 @@ mod sc2_pcr_plus_plus;
 mod significance;
 mod spectral;
 
+pub(crate) use anchored_icp::RING_REACH;
 pub use anchored_icp::{AnchoredIcp, AnchoredIcpResult};
 pub use consistency::{CompatibilityGraph, Consistency};
 pub use fast_mac::FastMac;

@@ -240,7 +240,10 @@ pub(super) fn finish(
     let overlap = contact.source_share.min(contact.reference_share).max(f64::EPSILON);
     let icp = AnchoredIcp {
         anchor_weight: (ANCHOR_WEIGHT / (overlap * overlap)).min(MOST_ANCHOR_WEIGHT),
-        ..AnchoredIcp::for_voxel(pair.scale.voxel)
+        ..match pair.scale.kind {
+            SceneKind::Lidar => AnchoredIcp::for_rotating_scanner(pair.scale.voxel),
+            SceneKind::Indoor | SceneKind::Object => AnchoredIcp::for_voxel(pair.scale.voxel),
+        }
     };
     let anchors = depth_map_matches(sets).concat();
     let (source, target) = (&pair.source.surface, &pair.target.surface);

@@ -13,7 +13,7 @@ use crate::data::{
 };
 use crate::error::{Error, Result};
 use crate::features::{Landmarks, estimate_normals, fpfh_at, orient_towards};
-use crate::pose::IcpTarget;
+use crate::pose::{IcpTarget, RING_REACH};
 use crate::random::Random;
 use crate::refine::RefinerConfig;
 use crate::scale::{Scale, SceneKind};
@@ -226,9 +226,14 @@ fn in_units(points: &[Point3<f64>], unit: f64) -> Cow<'_, [Point3<f64>]> {
     }
 }
 
-/// Normals from 20 neighbours within two voxels.
+/// Normals from 20 neighbours within two voxels, or, so that they are not all of one ring of a rotating scanner, as far
+/// as its rings may lie apart.
 fn surface(fine: Vec<Point3<f64>>, scale: &Scale) -> Result<IcpTarget> {
-    let normals = estimate_normals(&fine, &KdTree::new(&fine), 2.0 * scale.voxel, 20);
+    let reach = match scale.kind {
+        SceneKind::Lidar => RING_REACH,
+        SceneKind::Indoor | SceneKind::Object => 2.0,
+    };
+    let normals = estimate_normals(&fine, &KdTree::new(&fine), reach * scale.voxel, 20);
     IcpTarget::new(fine, normals)
 }
 

@@ -107,6 +107,7 @@ fn much_overlap_and_streets_are_solved_exactly() {
     solved(&kitchen(1, 0), 2.0, 0.08);
     solved(&kitchen(4, 3), 2.0, 0.08);
     let (folder, pairs, start) = ("lidar-dev", "pairs", "pert_hard");
-    // Measured: 0.4 degrees and 6 cm.
-    solved(&Case { folder, pairs, source: 4, reference: 2, start }, 1.0, 0.15);
+    // Measured: 0.36 degrees and 5 cm, and 0.25 degrees and 2 cm: 0.49 degrees if no point finds the next ring.
+    solved(&Case { folder, pairs, source: 4, reference: 2, start }, 0.8, 0.1);
+    solved(&Case { folder, pairs, source: 6, reference: 5, start }, 0.35, 0.05);
 }

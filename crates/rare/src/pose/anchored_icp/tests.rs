@@ -125,6 +125,29 @@ fn a_known_pose_is_recovered_from_either_cloud_alone_or_both() {
     }
 }
 
+/// A road in rings five voxels apart; those of different seeds lie between one another.
+fn rings(seed: u64) -> Surface {
+    let ring = |number: u32| {
+        let x = (f64::from(number) + 0.5 * seed as f64) * 5.0 * VOXEL;
+        (0..200).map(move |i| (Point3::new(x, f64::from(i) * 0.2 * VOXEL, 0.0), Vector3::z()))
+    };
+    (0..8).flat_map(ring).collect()
+}
+
+#[test]
+fn rings_that_never_meet_lie_on_one_road() {
+    let scene = Scene::new(rings);
+    let tilted = scene.truth * pose([0.0, 0.01, 0.0], [0.0, 0.0, 0.3 * VOXEL]);
+    let result = scene.align(&AnchoredIcp::for_rotating_scanner(VOXEL), &[], &tilted).unwrap();
+    // The road determines its normal and its height, no more.
+    let moved = result.target_from_source * scene.truth.inverse();
+    let (tilt, height) =
+        (moved.rotate(&Vector3::z()).xy().norm(), moved.apply(&Point3::origin()).z);
+    assert!(tilt < 1e-5 && height.abs() < 1e-3 * VOXEL && result.converged, "{tilt} {height}");
+    // Nothing is near enough where scans are dense.
+    assert!(scene.align(&AnchoredIcp::for_voxel(VOXEL), &[], &tilted).is_err());
+}
+
 #[test]
 fn where_the_clouds_lie_does_not_matter() {
     let place = RigidTransform::from_translation(Vector3::new(900.0, -700.0, 100.0));
