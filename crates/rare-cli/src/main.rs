@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 mod args;
+mod images;
 mod memory;
 mod network;
 mod options;

@@ -3,6 +3,7 @@
 mod config;
 mod encoded_views;
 mod hypotheses;
+mod illustration;
 mod initial;
 mod search;
 mod stopwatch;
@@ -15,6 +16,10 @@ pub use config::{Recipe, RefinerConfig};
 use encoded_views::DenseViews;
 pub use encoded_views::EncodedViews;
 use hypotheses::Candidate;
+pub use illustration::{
+    IllustratedCloud, IllustratedMap, IllustratedView, Illustration, IllustrationRequest,
+    PixelMatch,
+};
 pub use initial::InitialMethod;
 use search::Effort;
 use stopwatch::Stopwatch;
@@ -260,7 +265,7 @@ impl Refiner {
         clock: &mut Stopwatch<'_>,
     ) -> Result<CorrespondenceSets> {
         let recipe = &self.config.recipe;
-        let DenseViews { viewpoints, maps } = self.dense_views(pair, pose, clock);
+        let DenseViews { viewpoints, maps, .. } = self.dense_views(pair, pose, clock);
         let layers = clock.time("encode", || self.encode(pair, &maps))?;
         let features = clock.time("reduce", || views::reduce_all(layers, recipe.components))?;
         let lifted = clock.time("transfer", || {

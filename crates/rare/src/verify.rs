@@ -18,7 +18,7 @@ use serde::{Deserialize, Serialize};
 pub use confidence::{Model, REJECT_BELOW, Verdict};
 pub use contact::Contact;
 pub use overlap::{Overlap, overlap};
-pub use visibility::DepthConsistency;
+pub use visibility::{DepthConsistency, Visibility, VisibilityMask};
 
 use self::contact::Body;
 use self::visibility::OwnView;
@@ -133,6 +133,37 @@ impl<'a> Verifier<'a> {
             ),
             support: None,
         }
+    }
+}
+
+impl Verifier<'_> {
+    /// What the cameras of `frame` say of points of the other cloud (in its own frame, the unit of the clouds): of each the
+    /// gravest, since one sensor that looked through a surface refutes it.
+    #[must_use]
+    pub fn visibility(
+        &self,
+        frame: Frame,
+        points: &[Point3<f64>],
+        reference_from_source: &RigidTransform,
+    ) -> Vec<Visibility> {
+        let mut gravest = vec![Visibility::Unseen; points.len()];
+        for view in self.views.iter().filter(|view| view.frame() == frame) {
+            let seen = view.see(points, reference_from_source, self.voxel);
+            for (gravest, seen) in gravest.iter_mut().zip(seen) {
+                *gravest = (*gravest).max(seen);
+            }
+        }
+        gravest
+    }
+
+    /// What each camera says of what the other cloud shows in its pixels, in the order of the viewpoints.
+    #[must_use]
+    pub fn masks(&self, reference_from_source: &RigidTransform) -> Vec<VisibilityMask> {
+        let mask = |view: &OwnView| {
+            let moved = if view.frame() == Frame::Reference { self.source } else { self.reference };
+            view.mask(moved.points, reference_from_source, self.voxel)
+        };
+        self.views.par_iter().map(mask).collect()
     }
 }
 

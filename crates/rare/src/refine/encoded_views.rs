@@ -27,7 +27,9 @@ pub struct EncodedViews {
 /// What the virtual cameras see under a pose, densified.
 pub(super) struct DenseViews {
     pub(super) viewpoints: Vec<Viewpoint>,
-    /// For each view the reference's map, then the source's.
+    /// For each view the reference's map, then the source's: what the points themselves show ...
+    pub(super) sparse: Vec<DepthMap>,
+    /// ... and densified.
     pub(super) maps: Vec<DepthMap>,
 }
 
@@ -81,7 +83,7 @@ impl Refiner {
         let viewpoints = self.viewpoints(pair, pose);
         let sparse = clock.time("project", || views::project_all(pair, &viewpoints, pose));
         let maps = clock.time("densify", || views::densify_all(&sparse, self.densifier(pair)));
-        DenseViews { viewpoints, maps }
+        DenseViews { viewpoints, sparse, maps }
     }
 
     /// Steps 1 and 2 of a cloud alone, which stands on both sides of the pair: the reference's maps of its own views.
@@ -92,7 +94,7 @@ impl Refiner {
         let sparse = clock.time("project", || views::project_all(pair, &viewpoints, &pose));
         let sparse: Vec<DepthMap> = sparse.into_iter().step_by(2).collect();
         let maps = clock.time("densify", || views::densify_all(&sparse, self.densifier(pair)));
-        DenseViews { viewpoints, maps }
+        DenseViews { viewpoints, sparse, maps }
     }
 
     /// Step 3.

@@ -169,7 +169,8 @@ pub(super) fn match_all(
     Ok(CorrespondenceSets { sets })
 }
 
-fn matched(
+/// Mutual nearest neighbours among features of `kinds` kinds side by side.
+pub(super) fn matched(
     source: &PointFeatures,
     target: &PointFeatures,
     kinds: usize,

@@ -36,6 +36,23 @@ pub struct DepthConsistency {
     pub gross_violation: usize,
 }
 
+/// What a camera says of a point that was moved into it, the gravest last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Visibility {
+    /// Nothing: it is outside the image, or the camera's own cloud shows nothing there.
+    #[default]
+    Unseen,
+    /// It lies behind what the camera's own cloud shows.
+    Occluded,
+    /// It lies on it.
+    Agree,
+    /// It stands before it, in space that was seen to be empty ...
+    Violation,
+    /// ... by far more than noise.
+    GrossViolation,
+}
+
 impl DepthConsistency {
     /// Share of the comparable points (agreeing or violating) that agree; 0 where there is none.
     #[must_use]
@@ -57,6 +74,19 @@ impl DepthConsistency {
         if comparable == 0 { 1.0 } else { share(self.gross_violation, comparable) }
     }
 
+    fn count(&mut self, visibility: Visibility) {
+        match visibility {
+            Visibility::Unseen => {}
+            Visibility::Occluded => self.occluded += 1,
+            Visibility::Agree => self.agree += 1,
+            Visibility::Violation => self.violation += 1,
+            Visibility::GrossViolation => {
+                self.violation += 1;
+                self.gross_violation += 1;
+            }
+        }
+    }
+
     fn add(self, other: DepthConsistency) -> DepthConsistency {
         DepthConsistency {
             agree: self.agree + other.agree,
@@ -69,6 +99,19 @@ impl DepthConsistency {
 
 fn share(part: usize, whole: usize) -> f64 {
     if whole == 0 { 0.0 } else { part as f64 / whole as f64 }
+}
+
+/// What a camera says of what the other cloud shows in each of its pixels: a quarter of its resolution.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct VisibilityMask {
+    /// The frame of the camera; the other cloud's points were moved into it.
+    pub frame: Frame,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Row-major, `height x width`; unseen also where the other cloud has no point.
+    pub pixels: Vec<Visibility>,
 }
 
 /// A camera with what its own cloud shows in it.
@@ -100,35 +143,73 @@ impl OwnView {
         reference_from_source: &RigidTransform,
         voxel: f64,
     ) -> DepthConsistency {
-        let camera_from_moved = match self.viewpoint.frame {
-            Frame::Reference => self.viewpoint.camera_from_source(reference_from_source),
-            Frame::Source => self.viewpoint.camera_from_reference(reference_from_source),
-        };
+        let camera_from_moved = self.camera_from_moved(reference_from_source);
         let mut counts = DepthConsistency::default();
         for point in moved {
-            self.count(&camera_from_moved.apply(point), voxel, &mut counts);
+            counts.count(self.visibility(&camera_from_moved.apply(point), voxel));
         }
         counts
     }
 
-    fn count(&self, point: &Point3<f64>, voxel: f64, counts: &mut DepthConsistency) {
+    /// What the camera says of each of the other cloud's points.
+    pub(super) fn see(
+        &self,
+        moved: &[Point3<f64>],
+        reference_from_source: &RigidTransform,
+        voxel: f64,
+    ) -> Vec<Visibility> {
+        let camera_from_moved = self.camera_from_moved(reference_from_source);
+        let see = |point| self.visibility(&camera_from_moved.apply(point), voxel);
+        moved.par_iter().map(see).collect()
+    }
+
+    /// What the camera says of the nearest of the other cloud's points in each of its pixels.
+    pub(super) fn mask(
+        &self,
+        moved: &[Point3<f64>],
+        reference_from_source: &RigidTransform,
+        voxel: f64,
+    ) -> VisibilityMask {
+        let camera_from_moved = self.camera_from_moved(reference_from_source);
         let intrinsics = &self.viewpoint.camera.intrinsics;
-        let Some((u, v)) = pixel(point, intrinsics) else { return };
-        let Some(&[nearest, farthest]) = self.surfaces.get(v * intrinsics.width + u) else {
-            return;
-        };
-        if farthest <= 0.0 {
-            return;
+        let (width, height) = (intrinsics.width, intrinsics.height);
+        let mut nearest = vec![(f64::INFINITY, Visibility::Unseen); width * height];
+        for point in moved {
+            let point = camera_from_moved.apply(point);
+            let Some((u, v)) = pixel(&point, intrinsics) else { continue };
+            if let Some(seen) = nearest.get_mut(v * width + u).filter(|seen| point.z < seen.0) {
+                *seen = (point.z, self.visibility(&point, voxel));
+            }
         }
+        let pixels = nearest.into_iter().map(|(_, visibility)| visibility).collect();
+        VisibilityMask { frame: self.viewpoint.frame, width, height, pixels }
+    }
+
+    fn camera_from_moved(&self, reference_from_source: &RigidTransform) -> RigidTransform {
+        match self.viewpoint.frame {
+            Frame::Reference => self.viewpoint.camera_from_source(reference_from_source),
+            Frame::Source => self.viewpoint.camera_from_reference(reference_from_source),
+        }
+    }
+
+    /// What the camera says of a point in its frame.
+    fn visibility(&self, point: &Point3<f64>, voxel: f64) -> Visibility {
+        let intrinsics = &self.viewpoint.camera.intrinsics;
+        let surface =
+            pixel(point, intrinsics).and_then(|(u, v)| self.surfaces.get(v * intrinsics.width + u));
+        let Some(&[nearest, farthest]) = surface.filter(|surface| surface[1] > 0.0) else {
+            return Visibility::Unseen;
+        };
         let tolerance = TOLERANCE * voxel + TOLERANCE_BY_DEPTH * point.z;
         let before = f64::from(nearest) - point.z;
-        if before > tolerance {
-            counts.violation += 1;
-            counts.gross_violation += usize::from(before > (1.0 + GROSS) * tolerance);
+        if before > (1.0 + GROSS) * tolerance {
+            Visibility::GrossViolation
+        } else if before > tolerance {
+            Visibility::Violation
         } else if point.z > f64::from(farthest) + tolerance {
-            counts.occluded += 1;
+            Visibility::Occluded
         } else {
-            counts.agree += 1;
+            Visibility::Agree
         }
     }
 }
