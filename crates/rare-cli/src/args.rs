@@ -172,7 +172,7 @@ pub(crate) struct FeaturesArgs {
 pub(crate) fn command() -> clap::Command {
     Cli::command()
         .mut_subcommand("features", |features| {
-            ["json", "save_aligned", "depth_features", "verbose"]
+            ["json", "save_aligned", "report", "depth_features", "verbose"]
                 .into_iter()
                 .fold(features, |features, option| features.mut_arg(option, |arg| arg.hide(true)))
                 .mut_arg("output", |output| output.help("Write the features (NPZ)"))
@@ -185,6 +185,11 @@ pub(crate) fn command() -> clap::Command {
                     output
                         .value_name("DIR")
                         .help("The folder of the results; made if it does not exist")
+                })
+                .mut_arg("report", |report| {
+                    report.num_args(0).default_missing_value("index.html").help(
+                        "Write a page of all pairs, index.html, and one of each that was refined",
+                    )
                 })
         })
 }
@@ -220,6 +225,9 @@ pub(crate) struct DemoArgs {
     /// The folder for clouds and results; made if it does not exist
     #[arg(long, value_name = "DIR", default_value = "rare-demo")]
     pub(crate) output_dir: PathBuf,
+    /// Write a page (HTML) that shows what was done; opens in any browser, needs no network
+    #[arg(long, value_name = "FILE")]
+    pub(crate) report: Option<PathBuf>,
     /// Which room is simulated
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) seed: u64,

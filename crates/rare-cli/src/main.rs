@@ -14,6 +14,7 @@ mod outputs;
 mod plots;
 mod progress;
 mod record;
+mod report;
 mod run;
 mod speed;
 mod summary;

@@ -32,6 +32,9 @@ pub(crate) struct Options {
     /// Write the source cloud moved into the frame of the reference (.ply .pcd .xyz .npy)
     #[arg(long, value_name = "FILE")]
     pub(crate) save_aligned: Option<PathBuf>,
+    /// Write a page (HTML) that shows what was done and whether to believe it; opens in any browser, needs no network
+    #[arg(long, value_name = "FILE")]
+    pub(crate) report: Option<PathBuf>,
     /// The most accurate method, or the paper's recipe unchanged [default: default]
     #[arg(long, value_name = "PRESET", value_parser = choice::<Preset>(&["default", "paper"]))]
     pub(crate) preset: Option<Preset>,
@@ -123,6 +126,7 @@ pub(crate) struct Settings {
     pub(crate) output: Option<PathBuf>,
     pub(crate) json: Option<PathBuf>,
     pub(crate) save_aligned: Option<PathBuf>,
+    pub(crate) report: Option<PathBuf>,
     pub(crate) config: Option<PathBuf>,
 }
 
@@ -180,6 +184,7 @@ impl Options {
             output: self.output,
             json: self.json,
             save_aligned: self.save_aligned,
+            report: self.report,
             config: self.config,
         })
     }
@@ -200,6 +205,7 @@ impl Options {
             output: self.output.or(other.output),
             json: self.json.or(other.json),
             save_aligned: self.save_aligned.or(other.save_aligned),
+            report: self.report.or(other.report),
             preset: self.preset.or(other.preset),
             profile: self.profile.or(other.profile),
             camera: self.camera.or(other.camera),

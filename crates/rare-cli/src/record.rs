@@ -14,7 +14,7 @@ use crate::network::NetworkRecord;
 use crate::options::{Encoder, Preset, Settings};
 use crate::run::{Inputs, Registration};
 
-type Matrix<const N: usize> = [[f64; N]; N];
+pub(crate) type Matrix<const N: usize> = [[f64; N]; N];
 
 /// Everything that is known of a transform. The keys are part of the program's interface.
 #[derive(Serialize)]
@@ -207,7 +207,7 @@ fn chosen_camera(choice: CameraChoice, kind: SceneKind, recipe: &Recipe) -> Came
     }
 }
 
-fn rows(pose: &RigidTransform) -> Matrix<4> {
+pub(crate) fn rows(pose: &RigidTransform) -> Matrix<4> {
     let pose: Matrix4<f64> = pose.to_matrix();
     // Adding zero turns -0 into 0.
     matrix(|row, column| pose[(row, column)] + 0.0)

@@ -51,7 +51,7 @@ fn verdict_in_words(registration: &Registration) -> &'static str {
 }
 
 /// How far the initial transform was changed: the turn, and the way of the source's middle.
-fn moved(registration: &Registration, initial: &RigidTransform) -> String {
+pub(crate) fn moved(registration: &Registration, initial: &RigidTransform) -> String {
     let (source, reference) = (&registration.source.cloud, &registration.reference.cloud);
     let found = &registration.refinement.target_from_source;
     let (low, high) = source.bounds();

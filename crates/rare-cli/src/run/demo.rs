@@ -25,6 +25,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<u8> {
     let settings = Options {
         output: Some(folder.join("result.txt")),
         json: Some(folder.join("result.json")),
+        report: args.report.clone(),
         quiet: Some(args.quiet),
         ..Options::default()
     }

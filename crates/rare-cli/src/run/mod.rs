@@ -16,8 +16,9 @@ use std::io::{self, ErrorKind, Write};
 use std::path::Path;
 
 use anyhow::{Context, Result};
+use rare::refine::Illustration;
 use rare::verify::Verdict;
-use rare::{InitialMethod, Refinement, RigidTransform, Scan, io as files};
+use rare::{InitialMethod, Refinement, Refiner, RigidTransform, Scan, io as files};
 use rare_nets::official;
 use serde::Serialize;
 
@@ -25,7 +26,7 @@ use crate::args::{Cli, Clouds, Command, Direction};
 use crate::network::NetworkRecord;
 use crate::options::Settings;
 use crate::outputs::{self, Output};
-use crate::{NO_POSE, SUCCESS, record, summary};
+use crate::{NO_POSE, SUCCESS, record, report, summary};
 
 /// Runs a command; gives the exit code.
 pub(crate) fn run(cli: Cli) -> Result<u8> {
@@ -53,6 +54,8 @@ pub(crate) struct Registration {
     /// The transform that was given, source to reference.
     pub(crate) initial: Option<RigidTransform>,
     pub(crate) refinement: Refinement,
+    /// What was seen and matched, if a report or figures were asked for.
+    pub(crate) illustration: Option<Illustration>,
     /// The networks that were used.
     pub(crate) network: Option<NetworkRecord>,
     pub(crate) read_seconds: f64,
@@ -62,16 +65,16 @@ pub(crate) struct Registration {
 /// What was registered, as the record names it.
 #[derive(Serialize)]
 pub(crate) struct Inputs {
-    source: String,
-    reference: String,
+    pub(crate) source: String,
+    pub(crate) reference: String,
     #[serde(flatten)]
-    start: Start,
+    pub(crate) start: Start,
 }
 
 /// Where the initial transform came from.
 #[derive(Serialize)]
 #[serde(untagged)]
-enum Start {
+pub(crate) enum Start {
     Estimated {
         init_method: InitialMethod,
     },
@@ -106,6 +109,11 @@ impl Registration {
         if let Some(file) = &self.settings.json {
             files::write_whole(file, |writer| writer.write_all(json.as_bytes()))?;
         }
+        if let Some((file, illustration)) =
+            self.settings.report.as_ref().zip(self.illustration.as_ref())
+        {
+            report::write(file, self, illustration)?;
+        }
         if let Some(file) = &self.settings.save_aligned {
             files::write_cloud(file, &aligned(&self.source, &self.reference, pose))?;
         }
@@ -133,6 +141,7 @@ fn check_outputs(settings: &Settings, inputs: &[&Path]) -> Result<()> {
         ("--output", &settings.output),
         ("--json", &settings.json),
         ("--save-aligned", &settings.save_aligned),
+        ("--report", &settings.report),
     ];
     let output = |(option, path): (_, _)| Some(Output { option, path: Option::as_deref(path)? });
     let outputs: Vec<Output<'_>> = named.into_iter().filter_map(output).collect();
@@ -162,6 +171,18 @@ fn read_scan(file: &Path) -> Result<Scan> {
     let is_fragment = official::is_fragment(file);
     let cloud = if is_fragment { official::read_fragment(file) } else { files::read_cloud(file) };
     Ok(Scan::from(cloud?))
+}
+
+/// What was seen and matched, if it is to be shown.
+fn illustration(
+    refiner: &Refiner,
+    scans: [&Scan; 2],
+    initial: Option<&RigidTransform>,
+    refinement: &Refinement,
+    settings: &Settings,
+) -> rare::Result<Option<Illustration>> {
+    let asked = settings.report.is_some();
+    asked.then(|| report::illustrate(refiner, scans, initial, refinement)).transpose()
 }
 
 /// What an error of the registration is about.

@@ -11,7 +11,9 @@ use crate::args::{Clouds, Direction, RefineArgs, Start};
 use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::Settings;
 use crate::progress::Progress;
-use crate::run::{Inputs, Registration, check_outputs, read_scan, start_threads, which};
+use crate::run::{
+    Inputs, Registration, check_outputs, illustration, read_scan, start_threads, which,
+};
 
 pub(super) fn run(args: RefineArgs) -> Result<u8> {
     let settings = args.options.resolve()?;
@@ -59,6 +61,10 @@ pub(super) fn registration(
     };
     let mut refinement = problem.solve(&refiner).with_context(|| which(clouds))?;
     refinement.warnings.extend(network.iter().flat_map(NetworkEncoder::warnings));
+    let total_seconds = clock.elapsed().as_secs_f64();
+    let scans = [&problem.source, &problem.reference];
+    let initial = Some(&problem.initial);
+    let illustration = illustration(&refiner, scans, initial, &refinement, &settings)?;
     Ok(Registration {
         settings,
         inputs: named(clouds, start),
@@ -66,9 +72,10 @@ pub(super) fn registration(
         reference: problem.reference,
         initial: Some(problem.initial),
         refinement,
+        illustration,
         network: network.as_ref().map(NetworkEncoder::record),
         read_seconds,
-        total_seconds: clock.elapsed().as_secs_f64(),
+        total_seconds,
     })
 }
 

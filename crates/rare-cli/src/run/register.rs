@@ -8,7 +8,9 @@ use crate::args::{Clouds, RegisterArgs};
 use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::{Options, Settings};
 use crate::progress::Progress;
-use crate::run::{Inputs, Registration, Start, check_outputs, read_scan, start_threads, which};
+use crate::run::{
+    Inputs, Registration, Start, check_outputs, illustration, read_scan, start_threads, which,
+};
 
 pub(super) fn run(args: RegisterArgs) -> Result<u8> {
     let options = Options { init_method: args.init_method, ..args.options };
@@ -43,6 +45,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
         start: Start::Estimated { init_method: settings.init_method },
     };
     let total_seconds = clock.elapsed().as_secs_f64();
+    let illustration = illustration(&refiner, [&source, &reference], None, &refinement, &settings)?;
     Ok(Registration {
         settings,
         inputs,
@@ -50,6 +53,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
         reference,
         initial: None,
         refinement,
+        illustration,
         network: network.as_ref().map(NetworkEncoder::record),
         read_seconds,
         total_seconds,
