@@ -1,0 +1,119 @@
+// Where the viewer's camera stands for each preset, in the display frame of the reference.
+
+import { Box3, Matrix4, Vector3 } from "three";
+
+/** Axes of the sensors in their own frames; objects have no sensor. */
+const sensors = {
+  indoor: { forward: new Vector3(0, 0, 1), up: new Vector3(0, -1, 0), angle: 48 },
+  lidar: { forward: new Vector3(1, 0, 0), up: new Vector3(0, 0, 1), angle: 70 },
+};
+const usualAngle = 45;
+
+/** Matrix of a pose given by rows. */
+export function matrixOf(rows) {
+  return new Matrix4().set(...rows.flat());
+}
+
+/** The box that holds all but the outermost points of a cloud, moved by `pose`; stray points would make it huge. */
+export function boundsOf(cloud, pose) {
+  const step = Math.max(1, Math.floor(cloud.count / 4000));
+  const coordinates = [[], [], []];
+  const point = new Vector3();
+  for (let index = 0; index < cloud.count; index += step) {
+    pointOf(cloud, index, point).applyMatrix4(pose);
+    point.toArray().forEach((value, axis) => coordinates[axis].push(value));
+  }
+  const inner = coordinates.map((values) => innerRange(values));
+  return new Box3(new Vector3(...inner.map(([low]) => low)), new Vector3(...inner.map(([, high]) => high)));
+}
+
+function innerRange(values) {
+  if (values.length === 0) return [0, 1];
+  values.sort((a, b) => a - b);
+  const at = (share) => values[Math.round(share * (values.length - 1))];
+  return [at(0.02), at(0.98)];
+}
+
+/** One point of a decoded cloud, in its display frame. */
+export function pointOf(cloud, index, target = new Vector3()) {
+  const axis = (which) => cloud.low[which] + (cloud.size[which] * cloud.positions[4 * index + which]) / 65535;
+  return target.set(axis(0), axis(1), axis(2));
+}
+
+/** The usual distance between neighbouring points: that of a sample, scaled as surfaces scale. */
+export function spacingOf(cloud) {
+  const sample = [];
+  const step = Math.max(1, Math.floor(cloud.count / 3000));
+  for (let index = 0; index < cloud.count; index += step) sample.push(pointOf(cloud, index));
+  const nearest = [];
+  for (let index = 0; index < sample.length; index += 20) nearest.push(nearestDistance(sample, index));
+  nearest.sort((a, b) => a - b);
+  return (nearest[Math.floor(nearest.length / 2)] ?? 0.01) / Math.sqrt(step);
+}
+
+function nearestDistance(points, index) {
+  let least = Infinity;
+  points.forEach((point, other) => {
+    if (other !== index) least = Math.min(least, point.distanceToSquared(points[index]));
+  });
+  return Number.isFinite(least) ? Math.sqrt(least) : 0.01;
+}
+
+/** Preset cameras: each gives `position`, `target`, `up` and the vertical `angle` of view in degrees. */
+export class CameraPresets {
+  constructor(scene, bounds) {
+    this.kind = scene.kind;
+    this.up = new Vector3(...scene.up).normalize();
+    this.centre = bounds.getCenter(new Vector3());
+    this.radius = Math.max(bounds.getSize(new Vector3()).length() / 2, 1e-3);
+  }
+
+  /** The direction in which the reference's sensor looks, made level. */
+  levelForward() {
+    const forward = (sensors[this.kind]?.forward ?? sideways(this.up)).clone();
+    forward.addScaledVector(this.up, -forward.dot(this.up));
+    return forward.lengthSq() > 1e-6 ? forward.normalize() : sideways(this.up);
+  }
+
+  /** From behind and above, with everything in the picture. */
+  fit(aspect) {
+    const forward = this.levelForward();
+    const side = new Vector3().crossVectors(forward, this.up);
+    const height = this.kind === "lidar" ? 0.9 : 0.5;
+    const away = forward.clone().negate().addScaledVector(this.up, height).addScaledVector(side, 0.45).normalize();
+    return this.from(away, aspect, 1.0);
+  }
+
+  /** From above; what the reference's sensor faced is at the top of the picture. */
+  top(aspect) {
+    const away = this.up.clone().addScaledVector(this.levelForward(), -1e-3).normalize();
+    return this.from(away, aspect, 0.95);
+  }
+
+  from(away, aspect, margin) {
+    const half = Math.tan((usualAngle * Math.PI) / 360) * Math.min(1, aspect);
+    const position = this.centre.clone().addScaledVector(away, (this.radius * margin) / half);
+    return { position, target: this.centre.clone(), up: this.up, angle: usualAngle };
+  }
+
+  /** As the sensor of a cloud saw it; `pose` moves the cloud into the reference. Objects are seen from their front. */
+  sensor(pose, aspect) {
+    const axes = sensors[this.kind];
+    const position = new Vector3().setFromMatrixPosition(pose);
+    if (!axes || position.distanceTo(this.centre) > 4 * this.radius) return this.front(pose, aspect);
+    const forward = axes.forward.clone().transformDirection(pose);
+    const reach = Math.max(forward.dot(this.centre.clone().sub(position)), 0.3 * this.radius);
+    const target = position.clone().addScaledVector(forward, reach);
+    return { position, target, up: axes.up.clone().transformDirection(pose), angle: axes.angle };
+  }
+
+  front(pose, aspect) {
+    const away = this.levelForward().negate().addScaledVector(this.up, 0.3).transformDirection(pose);
+    return this.from(away, aspect, 1.0);
+  }
+}
+
+function sideways(up) {
+  const candidate = Math.abs(up.x) < 0.7 ? new Vector3(1, 0, 0) : new Vector3(0, 1, 0);
+  return candidate.addScaledVector(up, -candidate.dot(up)).normalize();
+}
