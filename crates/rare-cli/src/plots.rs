@@ -40,13 +40,7 @@ struct Plot<'a> {
 /// # Errors
 /// If a file cannot be written.
 pub(crate) fn write_all(folder: &Path, methods: &[MethodResult], success: Success) -> Result<()> {
-    let (rotation, translation) = match success {
-        Success::Pose { rotation, translation } => (rotation, translation),
-        Success::Rmse(limit) => (15.0, limit),
-    };
-    let turned =
-        |pair: &ScoredPair| pair.errors.map_or(f64::INFINITY, |errors| errors.exact_rotation);
-    let moved = |pair: &ScoredPair| pair.errors.map_or(f64::INFINITY, |errors| errors.translation);
+    let (rotation, translation) = limits(success);
     recall_plot("rotation error below, degrees", 2.0 * rotation, methods, turned)
         .write(&folder.join("recall_rotation.svg"))?;
     recall_plot("translation error below, metres", 2.0 * translation, methods, moved)
@@ -62,6 +56,24 @@ pub(crate) fn write_all(folder: &Path, methods: &[MethodResult], success: Succes
     }
 }
 
+/// The errors of a solved pair, degrees and metres, or what comes near them.
+pub(crate) fn limits(success: Success) -> (f64, f64) {
+    match success {
+        Success::Pose { rotation, translation } => (rotation, translation),
+        Success::Rmse(limit) => (15.0, limit),
+    }
+}
+
+/// The rotation error, degrees; of a pair without a transform infinite.
+pub(crate) fn turned(pair: &ScoredPair) -> f64 {
+    pair.errors.map_or(f64::INFINITY, |errors| errors.exact_rotation)
+}
+
+/// The translation error, metres; of a pair without a transform infinite.
+pub(crate) fn moved(pair: &ScoredPair) -> f64 {
+    pair.errors.map_or(f64::INFINITY, |errors| errors.translation)
+}
+
 /// The share of pairs whose error is below each threshold.
 fn recall_plot<'a>(
     x: &'a str,
@@ -69,13 +81,20 @@ fn recall_plot<'a>(
     methods: &'a [MethodResult],
     error: impl Fn(&ScoredPair) -> f64,
 ) -> Plot<'a> {
-    let curve = |method: &MethodResult| {
-        let threshold = |step: usize| x_end * step as f64 / STEPS as f64;
-        let share = |limit: f64| share_of(&method.pairs, |pair| error(pair) < limit);
-        (0..=STEPS).map(threshold).map(|limit| (limit, 100.0 * share(limit))).collect()
-    };
+    let curve = |method: &MethodResult| recall(&method.pairs, x_end, &error);
     let curves = methods.iter().map(|method| (method.name.as_str(), curve(method))).collect();
     Plot { title: "Recall", x, y: "pairs, %", x_end, y_end: 100.0, curves }
+}
+
+/// Thresholds from 0 to `end`, and the percentage of pairs whose error is below each.
+pub(crate) fn recall(
+    pairs: &[ScoredPair],
+    end: f64,
+    error: impl Fn(&ScoredPair) -> f64,
+) -> Vec<(f64, f64)> {
+    let threshold = |step: usize| end * step as f64 / STEPS as f64;
+    let share = |limit: f64| share_of(pairs, |pair| error(pair) < limit);
+    (0..=STEPS).map(threshold).map(|limit| (limit, 100.0 * share(limit))).collect()
 }
 
 /// The share of pairs in each bin of the error; the last one takes all that are worse.

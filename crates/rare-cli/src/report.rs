@@ -6,6 +6,7 @@
 mod clouds;
 mod command;
 mod data;
+mod index;
 mod page;
 
 use std::path::Path;
@@ -16,6 +17,7 @@ use rare::refine::{Illustration, IllustrationRequest};
 use rare::{Refinement, Refiner, RigidTransform, Scan};
 
 use self::data::Report;
+pub(crate) use self::index::{Index, Pages};
 use crate::run::Registration;
 
 /// Of each cloud no more points than that are drawn.
@@ -52,5 +54,14 @@ pub(crate) fn write(
 ) -> Result<()> {
     let report = Report::new(registration, illustration)?;
     let page = page::of_registration(&report)?;
+    write_whole(file, |writer| writer.write_all(page.as_bytes())).context("--report")
+}
+
+/// Writes the page of an evaluation.
+///
+/// # Errors
+/// If the file cannot be written.
+pub(crate) fn write_index(file: &Path, index: &Index) -> Result<()> {
+    let page = page::of_evaluation(index)?;
     write_whole(file, |writer| writer.write_all(page.as_bytes())).context("--report")
 }

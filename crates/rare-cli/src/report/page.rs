@@ -8,6 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use serde::Serialize;
 
 use super::data::Report;
+use super::index::Index;
 
 const STYLE: &str = include_str!("../../assets/report.css");
 /// A module by the name by which others import it.
@@ -53,6 +54,23 @@ pub(super) fn of_registration(report: &Report) -> Result<String> {
             ("script", include_str!("../../assets/report.js")),
             ("data", &json(&report.page)?),
             ("blobs", &blobs),
+        ],
+    ))
+}
+
+/// The page of an evaluation.
+///
+/// # Errors
+/// If a number cannot be written as JSON.
+pub(super) fn of_evaluation(index: &Index) -> Result<String> {
+    Ok(filled(
+        include_str!("../../assets/index.html"),
+        &[
+            ("title", &escaped(&index.title)),
+            ("css", STYLE),
+            ("importmap", &import_map(&[&SHARED])?),
+            ("script", include_str!("../../assets/index.js")),
+            ("data", &json(index)?),
         ],
     ))
 }

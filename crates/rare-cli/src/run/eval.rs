@@ -5,6 +5,7 @@
 
 mod listed;
 mod method;
+mod pages;
 mod paper;
 mod start;
 mod work;
@@ -18,6 +19,7 @@ use start::Starts;
 
 use crate::args::{DatasetKind, EvalArgs, Format};
 use crate::options::{Encoder, Settings};
+use crate::report::{self, Index};
 use crate::{SUCCESS, run, summary};
 
 /// Everything that is to be done.
@@ -34,10 +36,16 @@ struct Plan {
 pub(super) fn run(args: &EvalArgs) -> Result<u8> {
     if args.dataset == DatasetKind::Paper {
         let settings = resolve(args)?;
+        if settings.report.is_some() {
+            bail!("--report shows one benchmark, the paper's tables are several: evaluate one of them");
+        }
         return paper::run(args, &settings);
     }
     let scoring = args.scoring.clone();
     let is_shard = args.shard.is_some();
+    if is_shard && args.options.report.is_some() {
+        bail!("--report shows a whole evaluation: add it to the same command without --shard when all shards are done");
+    }
     let plan = Plan::new(args)?;
     let Some(folder) = plan.settings.output.clone() else {
         bail!("the results need a folder: add --out DIR");
@@ -48,9 +56,16 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8> {
         summary::say("this shard is done: put all of them together with `rare score DIR...`");
         return Ok(SUCCESS);
     }
+    let estimates = results.estimates()?;
     let methods = results::merge(&[results])?;
     let comparisons = super::score::compare(&methods, plan.dataset.protocol, &scoring);
     super::score::write_tables(&folder, &comparisons, &methods)?;
+    if let Some((name, comparison)) = plan.settings.report.as_ref().zip(comparisons.first()) {
+        let pages = pages::write_all(&plan, &folder)?;
+        let title = format!("{}: {} pairs", plan.dataset.name, plan.dataset.pairs.len());
+        let index = Index::new(title, comparison, &methods, &estimates, &pages);
+        report::write_index(&folder.join(name), &index)?;
+    }
     run::print(&super::score::in_format(&comparisons, Format::Text)?)?;
     Ok(SUCCESS)
 }

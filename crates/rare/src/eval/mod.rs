@@ -28,7 +28,7 @@ pub mod table;
 pub mod trajectory;
 
 pub use bootstrap::Interval;
-pub use comparison::{Comparison, MethodResult};
+pub use comparison::{Comparison, MethodResult, MethodSummary};
 pub use protocol::{Protocol, Rules, Success};
 pub use scored::{Errors, ScoredPair, TruePair};
 pub use summary::Summary;

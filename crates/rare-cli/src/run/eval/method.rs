@@ -95,16 +95,38 @@ impl Method {
                 Some(pairs) => estimator.on_pairs(pairs, source, reference, config),
                 None => estimator.on_features(source, reference, config),
             },
-            Kind::Refine(config) => {
-                let initial = RigidTransform::from_matrix(initial)?;
-                let refiner = Refiner::new(config.clone());
-                let refinement = match &start.correspondences {
-                    Some(pairs) => refiner.refine_matched(source, reference, &initial, pairs)?,
-                    None => refiner.refine(source, reference, &initial)?,
-                };
-                Ok(Found::refined(&refinement))
-            }
+            Kind::Refine(config) => Ok(Found::refined(&refine(
+                &Refiner::new(config.clone()),
+                source,
+                reference,
+                start,
+            )?)),
         }
+    }
+
+    /// The settings of the refiner, if the method is one.
+    pub(super) fn refiner(&self) -> Option<&RefinerConfig> {
+        match &self.kind {
+            Kind::Refine(config) => Some(config),
+            Kind::Init | Kind::Icp(..) | Kind::Estimate(..) => None,
+        }
+    }
+}
+
+/// Refines a start.
+///
+/// # Errors
+/// What the refiner has, or if the start is no rigid transform.
+pub(super) fn refine(
+    refiner: &Refiner,
+    source: &Scan,
+    reference: &Scan,
+    start: &Start,
+) -> rare::Result<Refinement> {
+    let initial = RigidTransform::from_matrix(&start.pose)?;
+    match &start.correspondences {
+        Some(pairs) => refiner.refine_matched(source, reference, &initial, pairs),
+        None => refiner.refine(source, reference, &initial),
     }
 }
 

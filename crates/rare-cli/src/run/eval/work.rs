@@ -126,18 +126,18 @@ fn finish_pair(index: usize, plan: &Plan, results: &ResultsFolder) -> Result<boo
 }
 
 /// The clouds of a pair.
-struct Loaded {
-    source: Scan,
-    reference: Scan,
+pub(super) struct Loaded {
+    pub(super) source: Scan,
+    pub(super) reference: Scan,
 }
 
 impl Loaded {
-    fn read(pair: &DatasetPair) -> Result<Loaded> {
+    pub(super) fn read(pair: &DatasetPair) -> Result<Loaded> {
         Ok(Loaded { source: read_scan(&pair.source)?, reference: read_scan(&pair.reference)? })
     }
 
     /// Where methods start, or why there is nothing to start from.
-    fn start(&self, index: usize, plan: &Plan) -> rare::Result<Start> {
+    pub(super) fn start(&self, index: usize, plan: &Plan) -> rare::Result<Start> {
         let missing = || rare::Error::Internal(format!("pair {index} has no start"));
         match &plan.starts {
             Starts::Given(poses) => {
