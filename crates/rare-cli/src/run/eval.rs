@@ -37,14 +37,18 @@ pub(super) fn run(args: &EvalArgs) -> Result<u8> {
     if args.dataset == DatasetKind::Paper {
         let settings = resolve(args)?;
         if settings.report.is_some() {
-            bail!("--report shows one benchmark, the paper's tables are several: evaluate one of them");
+            bail!(
+                "--report shows one benchmark, the paper's tables are several: evaluate one of them"
+            );
         }
         return paper::run(args, &settings);
     }
     let scoring = args.scoring.clone();
     let is_shard = args.shard.is_some();
     if is_shard && args.options.report.is_some() {
-        bail!("--report shows a whole evaluation: add it to the same command without --shard when all shards are done");
+        bail!(
+            "--report shows a whole evaluation: add it to the same command without --shard when all shards are done"
+        );
     }
     let plan = Plan::new(args)?;
     let Some(folder) = plan.settings.output.clone() else {

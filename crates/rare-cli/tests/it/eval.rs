@@ -398,3 +398,42 @@ fn a_list_of_pairs_stands_for_a_missing_log() {
         "missing",
     ]);
 }
+
+#[test]
+fn an_evaluation_is_shown_with_all_its_pairs() {
+    let workplace = benchmark();
+    let limit = ["--limit", "3", "--methods", "init,refine,refine-no-polish"];
+    finish(command(&workplace, "plain", &limit).spawn().unwrap());
+    let with_report = [&limit[..], &["--report"]].concat();
+    finish(command(&workplace, "shown", &with_report).spawn().unwrap());
+    assert_equal_tables(&workplace, "plain", "shown");
+    let page = workplace.text("shown/index.html");
+    let (_, data) = page.split_once("id=\"data\">").unwrap();
+    let data: Value = serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap();
+    let pairs = data["pairs"].as_array().unwrap();
+    assert_eq!((pairs.len(), data["methods"].as_array().unwrap().len()), (9, 3));
+    for pair in pairs {
+        let refined = pair["method"].as_str().unwrap().starts_with("refine");
+        assert_eq!(pair["page"].is_string(), refined, "{pair}");
+        assert_eq!(pair["confidence"].is_number(), refined, "{pair}");
+        if let Some(link) = pair["page"].as_str() {
+            let page = workplace.text(&format!("shown/{link}"));
+            // The command on the page of a pair has what it needs.
+            let init = workplace.path(&format!("shown/{}", link.replace(".html", ".txt")));
+            assert!(page.contains("rare refine room") && init.is_file(), "{link}");
+        }
+    }
+    let recall = &data["methods"][0]["recall_rotation"];
+    assert!(recall.as_array().unwrap().len() > 100 && recall[0][1] == 0.0, "{recall}");
+
+    // What is there is not made again.
+    let link = pairs.iter().find_map(|pair| pair["page"].as_str()).unwrap();
+    workplace.write(&format!("shown/{link}"), "kept");
+    finish(command(&workplace, "shown", &with_report).spawn().unwrap());
+    assert_eq!(workplace.text(&format!("shown/{link}")), "kept");
+    for refused in [&["--shard", "0/2"][..], &[]] {
+        let kind = if refused.is_empty() { "paper" } else { "folder" };
+        let all = [&["eval", kind, "room", "--out", "other", "--report"], refused].concat();
+        workplace.run(&all).assert_refused(&["--report"]);
+    }
+}

@@ -15,6 +15,7 @@ mod outputs;
 mod pickle_writer;
 mod readme;
 mod registration;
+mod report;
 mod shared;
 mod synthetic_benchmark;
 #[cfg(feature = "fetch")]

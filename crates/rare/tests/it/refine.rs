@@ -1,6 +1,7 @@
 //! From two clouds and a start to a verified pose, over all steps.
 
 mod given_features;
+mod illustration;
 mod scenes;
 mod switches;
 
