@@ -7,31 +7,34 @@ const sensors = {
   indoor: { forward: new Vector3(0, 0, 1), up: new Vector3(0, -1, 0), angle: 48 },
   lidar: { forward: new Vector3(1, 0, 0), up: new Vector3(0, 0, 1), angle: 70 },
 };
-const usualAngle = 45;
+const usualAngle = 40;
+const fitMargin = 1.1;
 
 /** Matrix of a pose given by rows. */
 export function matrixOf(rows) {
   return new Matrix4().set(...rows.flat());
 }
 
-/** The box that holds all but the outermost points of a cloud, moved by `pose`; stray points would make it huge. */
-export function boundsOf(cloud, pose) {
+/** A few thousand points of a cloud, moved by `pose`, without the outermost: stray points would make the scene tiny. */
+export function samplePoints(cloud, pose) {
   const step = Math.max(1, Math.floor(cloud.count / 4000));
-  const coordinates = [[], [], []];
-  const point = new Vector3();
-  for (let index = 0; index < cloud.count; index += step) {
-    pointOf(cloud, index, point).applyMatrix4(pose);
-    point.toArray().forEach((value, axis) => coordinates[axis].push(value));
-  }
-  const inner = coordinates.map((values) => innerRange(values));
-  return new Box3(new Vector3(...inner.map(([low]) => low)), new Vector3(...inner.map(([, high]) => high)));
+  const points = [];
+  for (let index = 0; index < cloud.count; index += step) points.push(pointOf(cloud, index).applyMatrix4(pose));
+  const box = innerBox(points);
+  const inside = points.filter((point) => box.containsPoint(point));
+  return inside.length > 0 ? inside : [new Vector3()];
+}
+
+function innerBox(points) {
+  const ranges = [0, 1, 2].map((axis) => innerRange(points.map((point) => point.getComponent(axis))));
+  return new Box3(new Vector3(...ranges.map(([low]) => low)), new Vector3(...ranges.map(([, high]) => high)));
 }
 
 function innerRange(values) {
   if (values.length === 0) return [0, 1];
   values.sort((a, b) => a - b);
   const at = (share) => values[Math.round(share * (values.length - 1))];
-  return [at(0.02), at(0.98)];
+  return [at(0.005), at(0.995)];
 }
 
 /** One point of a decoded cloud, in its display frame. */
@@ -61,9 +64,12 @@ function nearestDistance(points, index) {
 
 /** Preset cameras: each gives `position`, `target`, `up` and the vertical `angle` of view in degrees. */
 export class CameraPresets {
-  constructor(scene, bounds) {
+  /** `points`: a sample of both clouds. */
+  constructor(scene, points) {
     this.kind = scene.kind;
     this.up = new Vector3(...scene.up).normalize();
+    this.points = points;
+    const bounds = new Box3().setFromPoints(points);
     this.centre = bounds.getCenter(new Vector3());
     this.radius = Math.max(bounds.getSize(new Vector3()).length() / 2, 1e-3);
   }
@@ -81,19 +87,47 @@ export class CameraPresets {
     const side = new Vector3().crossVectors(forward, this.up);
     const height = this.kind === "lidar" ? 0.9 : 0.5;
     const away = forward.clone().negate().addScaledVector(this.up, height).addScaledVector(side, 0.45).normalize();
-    return this.from(away, aspect, 1.0);
+    return this.from(away, aspect);
   }
 
   /** From above; what the reference's sensor faced is at the top of the picture. */
   top(aspect) {
     const away = this.up.clone().addScaledVector(this.levelForward(), -1e-3).normalize();
-    return this.from(away, aspect, 0.95);
+    return this.from(away, aspect);
   }
 
-  from(away, aspect, margin) {
-    const half = Math.tan((usualAngle * Math.PI) / 360) * Math.min(1, aspect);
-    const position = this.centre.clone().addScaledVector(away, (this.radius * margin) / half);
-    return { position, target: this.centre.clone(), up: this.up, angle: usualAngle };
+  /** From the direction `away`, just so far that all sampled points are in the picture. */
+  from(away, aspect) {
+    const right = new Vector3().crossVectors(this.up, away).normalize();
+    const above = new Vector3().crossVectors(away, right);
+    const half = Math.tan((usualAngle * Math.PI) / 360) / fitMargin;
+    let target = this.centre.clone();
+    // Twice: perspective shifts the middle of the picture away from the middle of the box.
+    for (let round = 0; round < 2; round += 1) target = this.middleInPicture(target, away, right, above, half, aspect);
+    const distance = this.distanceFor(target, away, right, above, half, aspect);
+    return { position: target.clone().addScaledVector(away, distance), target, up: this.up, angle: usualAngle };
+  }
+
+  distanceFor(target, away, right, above, half, aspect) {
+    return this.points.reduce((most, point) => {
+      const offset = point.clone().sub(target);
+      const side = Math.max(Math.abs(offset.dot(right)) / (half * aspect), Math.abs(offset.dot(above)) / half);
+      return Math.max(most, side + offset.dot(away));
+    }, 1e-3);
+  }
+
+  middleInPicture(target, away, right, above, half, aspect) {
+    const distance = this.distanceFor(target, away, right, above, half, aspect);
+    const places = this.points.map((point) => {
+      const offset = point.clone().sub(target);
+      const depth = Math.max(distance - offset.dot(away), 1e-6);
+      return [offset.dot(right) / depth, offset.dot(above) / depth];
+    });
+    const middle = [0, 1].map((axis) => {
+      const values = places.map((place) => place[axis]);
+      return (Math.min(...values) + Math.max(...values)) / 2;
+    });
+    return target.clone().addScaledVector(right, middle[0] * distance).addScaledVector(above, middle[1] * distance);
   }
 
   /** As the sensor of a cloud saw it; `pose` moves the cloud into the reference. Objects are seen from their front. */
@@ -109,7 +143,7 @@ export class CameraPresets {
 
   front(pose, aspect) {
     const away = this.levelForward().negate().addScaledVector(this.up, 0.3).transformDirection(pose);
-    return this.from(away, aspect, 1.0);
+    return this.from(away, aspect);
   }
 }
 

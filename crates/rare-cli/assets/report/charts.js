@@ -15,7 +15,7 @@ export function svg(tag, options = {}, ...children) {
   return made;
 }
 
-const frame = { width: 560, height: 260, left: 46, right: 14, top: 12, bottom: 40 };
+const frame = { width: 560, height: 260, left: 46, right: 14, top: 28, bottom: 40 };
 
 /** Round numbers from 0 to `end`, about `wanted` of them. */
 export function ticksTo(end, wanted = 5) {
@@ -41,7 +41,7 @@ function axes({ xEnd, yEnd, xLabel, yLabel }) {
   }
   group.append(svg("line", { x1: x(0), x2: x(xEnd), y1: y(0), y2: y(0), class: "base" }));
   group.append(svg("text", { x: x(xEnd), y: frame.height - 5, "text-anchor": "end", class: "axis-label", text: xLabel }));
-  group.append(svg("text", { x: frame.left, y: frame.height - 5, class: "axis-label", text: `vertical: ${yLabel}` }));
+  group.append(svg("text", { x: 4, y: 13, class: "axis-label", text: yLabel }));
   return { x, y, group };
 }
 

@@ -50,6 +50,8 @@ export const shadeShader = {
     uniform sampler2D colours;
     uniform sampler2D depths;
     uniform vec2 pixel;
+    uniform int samples;
+    uniform float reach;
     uniform vec3 background;
     uniform float near;
     uniform float far;
@@ -60,24 +62,31 @@ export const shadeShader = {
       return log2(near * far / (far - depth * (far - near)));
     }
 
-    float darkening(float here, vec2 offset) {
-      float depth = texture2D(depths, place + offset * pixel).r;
-      return depth >= 1.0 ? 0.0 : clamp(here - logarithmicDepth(depth), 0.0, 0.05);
+    float darkening(float here, vec2 at, vec2 offset) {
+      float depth = texture2D(depths, at + offset * reach * pixel).r;
+      return depth >= 1.0 ? 0.0 : clamp(here - logarithmicDepth(depth), 0.0, 0.03);
+    }
+
+    vec3 shaded(vec2 at) {
+      float depth = texture2D(depths, at).r;
+      if (depth >= 1.0) return background;
+      float here = logarithmicDepth(depth);
+      float sum = darkening(here, at, vec2(1.0, 0.0)) + darkening(here, at, vec2(-1.0, 0.0))
+        + darkening(here, at, vec2(0.0, 1.0)) + darkening(here, at, vec2(0.0, -1.0))
+        + darkening(here, at, vec2(1.5, 1.5)) + darkening(here, at, vec2(-1.5, 1.5))
+        + darkening(here, at, vec2(1.5, -1.5)) + darkening(here, at, vec2(-1.5, -1.5));
+      return texture2D(colours, at).rgb * max(exp(-strength * sum), 0.25);
     }
 
     void main() {
-      float depth = texture2D(depths, place).r;
-      if (depth >= 1.0) {
-        gl_FragColor = vec4(background, 1.0);
-        return;
+      vec3 sum = vec3(0.0);
+      vec2 first = place - pixel * 0.5 * float(samples - 1);
+      for (int row = 0; row < samples; row++) {
+        for (int column = 0; column < samples; column++) {
+          sum += shaded(first + pixel * vec2(column, row));
+        }
       }
-      float here = logarithmicDepth(depth);
-      float sum = darkening(here, vec2(1.0, 0.0)) + darkening(here, vec2(-1.0, 0.0))
-        + darkening(here, vec2(0.0, 1.0)) + darkening(here, vec2(0.0, -1.0))
-        + darkening(here, vec2(0.7, 0.7)) + darkening(here, vec2(-0.7, 0.7))
-        + darkening(here, vec2(0.7, -0.7)) + darkening(here, vec2(-0.7, -0.7));
-      float shade = max(exp(-strength * sum), 0.3);
-      gl_FragColor = vec4(texture2D(colours, place).rgb * shade, 1.0);
+      gl_FragColor = vec4(sum / float(samples * samples), 1.0);
     }`,
 };
 

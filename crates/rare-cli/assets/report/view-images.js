@@ -7,7 +7,7 @@ import { checkbox, count, element, metres, slider } from "report/page";
 const mapKinds = [
   ["sparse", "raw depth"],
   ["dense", "densified depth"],
-  ["features", "features, three principal components as red, green, blue"],
+  ["features", "features (three principal components)"],
 ];
 const matchGap = 12;
 

@@ -36,7 +36,7 @@ export class ViewerPanel {
     this.describePicture();
     this.panel.append(
       this.makePoseControls(), this.makeColourControls(), this.makeCloudControls(),
-      this.makeViewControls(), this.makeSetControls(data.sets), this.makeKeysHelp(),
+      this.makeViewControls(), this.makeSetControls(data.sets), this.makeSaveButton(), this.makeKeysHelp(),
     );
     this.legend = element("div", { class: "legend" });
     this.caption = element("p", { class: "pose-caption", role: "status" });
@@ -66,7 +66,7 @@ export class ViewerPanel {
     const last = this.poses.length - 1;
     this.poseBar = choiceBar("Pose of the source", "pose", choices, this.poses[last].key, (key) => this.setPose(key));
     this.poseSlider = slider("Blend between poses", { low: 0, high: last, step: 0.01, value: last, describe: (value) => this.poseText(value) }, (value) => this.blend(value));
-    this.apartSlider = slider("Pull apart", { low: 0, high: 1, step: 0.01, value: 0 }, (value) => this.viewer.pullApart(value));
+    this.apartSlider = slider("Pull clouds apart", { low: 0, high: 1, step: 0.01, value: 0 }, (value) => this.viewer.pullApart(value));
     this.poseSlider.root.classList.add("full");
     return element("div", { class: "group" }, this.poseBar.root, this.poseSlider.root, this.apartSlider.root);
   }
@@ -85,7 +85,7 @@ export class ViewerPanel {
       return box.root;
     });
     this.sizeSlider = slider("Point size", { low: -2, high: 2, step: 0.25, value: 0 }, (value) => this.viewer.setPointScale(2 ** value));
-    const legend = element("legend", { text: "Clouds" });
+    const legend = element("legend", { text: "Clouds, points shown" });
     return element("div", { class: "group" }, element("fieldset", {}, legend, ...rows), this.sizeSlider.root);
   }
 
@@ -93,9 +93,8 @@ export class ViewerPanel {
     const buttons = presets.map(([preset, label, key]) => element("button", {
       type: "button", text: label, title: `key ${key}`, on: { click: () => this.viewer.lookFrom(preset) },
     }));
-    const save = element("button", { type: "button", text: "Save picture", on: { click: () => this.savePicture() } });
     const legend = element("legend", { text: "Look from" });
-    return element("fieldset", { class: "group buttons" }, legend, ...buttons, save);
+    return element("fieldset", { class: "group buttons" }, legend, ...buttons);
   }
 
   makeSetControls(sets) {
@@ -106,6 +105,10 @@ export class ViewerPanel {
     if (sets.length === 0) return element("p", { class: "muted", text: "No correspondences were recorded." });
     const kindRow = element("div", { class: "inline" }, ...kinds);
     return element("fieldset", { class: "group" }, legend, ...this.setBoxes.map((box) => box.root), kindRow);
+  }
+
+  makeSaveButton() {
+    return element("button", { type: "button", text: "Save picture as PNG", on: { click: () => this.savePicture() } });
   }
 
   makeKeysHelp() {
@@ -238,8 +241,8 @@ export class ViewerPanel {
 }
 
 function shownPoints(cloud) {
-  if (cloud.shown === cloud.points) return `${count(cloud.points)} points`;
-  return `${count(cloud.shown)} of ${count(cloud.points)} points shown`;
+  if (cloud.shown === cloud.points) return count(cloud.points);
+  return `${count(cloud.shown)} of ${count(cloud.points)}`;
 }
 
 function legendOf(mode, scene) {

@@ -4,12 +4,14 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/OrbitControls";
 
-import { boundsOf, CameraPresets, spacingOf } from "report/cameras";
+import { CameraPresets, samplePoints, spacingOf } from "report/cameras";
 import { bytesOf, cloudColours, matchColours, residualPalette, visibilityPalette } from "report/colours";
 import { PosePath } from "report/poses";
 import { lineShader, pointShader, shadeShader } from "report/shaders";
 
 export const colourModes = ["cloud", "residual", "visibility"];
+/** A fine picture has this many samples across and down each of its pixels. */
+const fineSamples = 2;
 const lineStyles = {
   inlier: { width: 1.5, opacity: 0.75, dash: 0 },
   outlier: { width: 1.1, opacity: 0.6, dash: 9 },
@@ -42,9 +44,12 @@ export class Viewer {
   // ---- making
 
   makePresets(scene, clouds) {
-    const bounds = boundsOf(clouds.reference, new THREE.Matrix4());
-    bounds.union(boundsOf(clouds.source, this.path.at(this.path.last)));
-    this.presets = new CameraPresets(scene, bounds);
+    const reference = samplePoints(clouds.reference, new THREE.Matrix4());
+    const sourceAt = (stop) => samplePoints(clouds.source, this.path.at(stop));
+    const final = new CameraPresets(scene, [...reference, ...sourceAt(this.path.last)]);
+    // The pose before the last also has its place in the picture, unless it is so far off that all would look small.
+    const both = new CameraPresets(scene, [...final.points, ...sourceAt(this.path.last - 1)]);
+    this.presets = both.radius < 1.5 * final.radius ? both : final;
   }
 
   makeClouds(clouds) {
@@ -78,21 +83,22 @@ export class Viewer {
   }
 
   makeShading() {
-    this.target = new THREE.WebGLRenderTarget(1, 1, { minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
-    this.target.depthTexture = new THREE.DepthTexture(1, 1, THREE.UnsignedIntType);
+    this.targets = { quick: makeTarget(), fine: makeTarget() };
     this.shade = new THREE.ShaderMaterial({
       vertexShader: shadeShader.vertex,
       fragmentShader: shadeShader.fragment,
       depthTest: false,
       depthWrite: false,
       uniforms: {
-        colours: { value: this.target.texture },
-        depths: { value: this.target.depthTexture },
+        colours: { value: null },
+        depths: { value: null },
         pixel: { value: new THREE.Vector2() },
+        samples: { value: 1 },
+        reach: { value: 1 },
         background: { value: this.background },
         near: { value: 0.1 },
         far: { value: 100 },
-        strength: { value: 9 },
+        strength: { value: 14 },
       },
     });
     const screen = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), this.shade);
@@ -133,10 +139,9 @@ export class Viewer {
     this.renderer.setPixelRatio(ratio);
     this.renderer.setSize(width, height);
     const pixels = this.renderer.getDrawingBufferSize(new THREE.Vector2());
-    this.target.setSize(pixels.x, pixels.y);
-    this.shade.uniforms.pixel.value.set(1.3 * ratio / pixels.x, 1.3 * ratio / pixels.y);
+    this.targets.quick.setSize(pixels.x, pixels.y);
+    this.targets.fine.setSize(pixels.x * fineSamples, pixels.y * fineSamples);
     this.lineShared.resolution.value.set(pixels.x / ratio, pixels.y / ratio);
-    this.shared.smallest.value = 1.6 * ratio;
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
     this.requestRender();
@@ -253,23 +258,44 @@ export class Viewer {
 
   // ---- drawing
 
+  /** Draws soon, quickly; and again in fine quality when nothing has changed for a moment. */
   requestRender() {
-    if (this.requested) return;
-    this.requested = requestAnimationFrame(() => this.render());
+    this.requested ||= requestAnimationFrame(() => {
+      this.draw(this.targets.quick, 1);
+      clearTimeout(this.refining);
+      this.refining = setTimeout(() => this.render(), 160);
+    });
   }
 
+  /** Draws at once, in fine quality. */
   render() {
+    this.draw(this.targets.fine, fineSamples);
+  }
+
+  draw(target, samples) {
     cancelAnimationFrame(this.requested);
+    clearTimeout(this.refining);
     this.requested = 0;
-    const height = this.target.height;
-    this.shared.pixelsPerUnit.value = height / (2 * Math.tan((this.camera.fov * Math.PI) / 360));
-    this.renderer.setRenderTarget(this.target);
+    this.prepare(target, samples);
+    this.renderer.setRenderTarget(target);
     this.renderer.clear();
     this.renderer.render(this.pointScene, this.camera);
     this.renderer.setRenderTarget(null);
     this.renderer.clear();
     this.renderer.render(this.screenScene, this.camera);
     this.renderer.render(this.lineScene, this.camera);
+  }
+
+  prepare(target, samples) {
+    const ratio = this.renderer.getPixelRatio();
+    const { uniforms } = this.shade;
+    this.shared.pixelsPerUnit.value = target.height / (2 * Math.tan((this.camera.fov * Math.PI) / 360));
+    this.shared.smallest.value = 1.6 * ratio * samples;
+    uniforms.colours.value = target.texture;
+    uniforms.depths.value = target.depthTexture;
+    uniforms.pixel.value.set(1 / target.width, 1 / target.height);
+    uniforms.samples.value = samples;
+    uniforms.reach.value = 1.3 * ratio * samples;
   }
 
   /** Draws at once and reads the picture back: width, height and RGBA bytes, rows from the bottom. */
@@ -289,6 +315,12 @@ export class Viewer {
   }
 }
 
+function makeTarget() {
+  const target = new THREE.WebGLRenderTarget(1, 1, { minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
+  target.depthTexture = new THREE.DepthTexture(1, 1, THREE.UnsignedIntType);
+  return target;
+}
+
 function middleOf(cloud) {
   return new THREE.Vector3(...cloud.low).addScaledVector(new THREE.Vector3(...cloud.size), 0.5);
 }
@@ -304,7 +336,7 @@ function makePoints(cloud, name, shared) {
   geometry.setAttribute("position", new THREE.BufferAttribute(cloud.positions, 4, true));
   geometry.setAttribute("residuals", new THREE.BufferAttribute(cloud.residuals, 4, true));
   geometry.setAttribute("visibility", new THREE.BufferAttribute(cloud.visibility, 4, true));
-  const diameter = 1.5 * spacingOf(cloud);
+  const diameter = 2.2 * spacingOf(cloud);
   const colour = new THREE.Vector3(...bytesOf(cloudColours[name]).map((byte) => byte / 255));
   const material = new THREE.ShaderMaterial({
     vertexShader: pointShader.vertex,
