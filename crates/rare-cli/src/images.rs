@@ -16,11 +16,11 @@ const VIRIDIS: [[f32; 3]; 9] = [
     [170.0, 220.0, 50.0],
     [253.0, 231.0, 37.0],
 ];
-/// Where nothing was seen.
-pub(crate) const NOTHING: [u8; 3] = [24, 24, 28];
+/// Where nothing was seen: white on paper, transparent in files. No other colour is quite white.
+pub(crate) const NOTHING: [u8; 3] = [255; 3];
 /// Agreement, occlusion and free-space violation, from the palette of Okabe and Ito.
 pub(crate) const AGREE: [u8; 3] = [0, 158, 115];
-pub(crate) const OCCLUDED: [u8; 3] = [120, 120, 128];
+pub(crate) const OCCLUDED: [u8; 3] = [86, 180, 233];
 pub(crate) const VIOLATION: [u8; 3] = [213, 94, 0];
 /// Values beyond this share at either end do not stretch the colours.
 const OUTLYING: f32 = 0.01;
@@ -95,7 +95,7 @@ fn feature_image(map: &FeatureMap, ranges: &[Option<[f32; 2]>; 3]) -> Image {
         std::array::from_fn(|channel| {
             let [low, high] = ranges[channel].unwrap_or([0.0, 1.0]);
             let share = (value(map, channel, pixel) - low) / (high - low).max(f32::MIN_POSITIVE);
-            (40.0 + 215.0 * share.clamp(0.0, 1.0)) as u8
+            (40.0 + 210.0 * share.clamp(0.0, 1.0)) as u8
         })
     });
     Image { width: map.width(), height: map.height(), pixels: pixels.collect() }
@@ -137,17 +137,19 @@ fn value(map: &FeatureMap, channel: usize, pixel: usize) -> f32 {
 }
 
 impl Image {
-    /// The image as a PNG file.
+    /// The image as a PNG file, transparent where nothing was seen.
     ///
     /// # Errors
     /// If the encoder refuses the size.
     pub(crate) fn to_png(&self) -> Result<Vec<u8>, png::EncodingError> {
         let mut file = Vec::new();
         let mut encoder = png::Encoder::new(&mut file, self.width as u32, self.height as u32);
-        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_color(png::ColorType::Rgba);
         encoder.set_depth(png::BitDepth::Eight);
         let mut writer = encoder.write_header()?;
-        writer.write_image_data(self.pixels.as_flattened())?;
+        let opaque = |pixel: &[u8; 3]| if *pixel == NOTHING { 0 } else { 255 };
+        let pixels = self.pixels.iter().map(|pixel| [pixel[0], pixel[1], pixel[2], opaque(pixel)]);
+        writer.write_image_data(pixels.collect::<Vec<_>>().as_flattened())?;
         writer.finish()?;
         Ok(file)
     }
@@ -173,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn features_are_stretched_alike_and_unknown_pixels_stay_dark() {
+    fn features_are_stretched_alike_and_unknown_pixels_stay_empty() {
         let map = |values: Vec<f32>| FeatureMap::new(3, 1, 2, values).unwrap();
         let first = map(vec![0.0, 2.0, 0.0, -1.0, 0.0, 0.0]);
         let second = map(vec![4.0, 2.0, 1.0, -1.0, 0.0, 0.0]);
@@ -185,12 +187,16 @@ mod tests {
 
     #[test]
     fn an_image_comes_back_from_its_file() {
-        let pixels = vec![[1, 2, 3], [4, 5, 6], [7, 8, 9], [0, 255, 0], [9, 9, 9], [1, 0, 1]];
+        let pixels = vec![[1, 2, 3], [4, 5, 6], [7, 8, 9], [0, 255, 0], NOTHING, [1, 0, 1]];
         let image = Image { width: 3, height: 2, pixels };
         let file = image.to_png().unwrap();
         let mut reader = png::Decoder::new(std::io::Cursor::new(file)).read_info().unwrap();
         let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
         reader.next_frame(&mut bytes).unwrap();
-        assert_eq!(bytes, image.pixels.as_flattened());
+        for (found, pixel) in bytes.as_chunks::<4>().0.iter().zip(&image.pixels) {
+            assert_eq!(found[..3], pixel[..]);
+            assert_eq!(found[3] == 0, *pixel == NOTHING);
+        }
+        assert_eq!(bytes.len(), 24);
     }
 }

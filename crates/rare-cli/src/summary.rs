@@ -26,7 +26,8 @@ pub(crate) fn describe(registration: &Registration) -> String {
         format!("{} of {} correspondences", refinement.inliers, refinement.correspondences),
     );
     if let Some(initial) = &registration.initial {
-        line("moved", format!("{} from the initial transform", moved(registration, initial)));
+        let (degrees, metres) = moved(registration, initial);
+        line("moved", format!("{degrees:.3} degrees and {metres:.4} m from the initial transform"));
     }
     line(
         "time",
@@ -50,18 +51,14 @@ fn verdict_in_words(registration: &Registration) -> &'static str {
     }
 }
 
-/// How far the initial transform was changed: the turn, and the way of the source's middle.
-pub(crate) fn moved(registration: &Registration, initial: &RigidTransform) -> String {
+/// How far the initial transform was changed: the turn, degrees, and the way of the source's middle, metres.
+pub(crate) fn moved(registration: &Registration, initial: &RigidTransform) -> (f64, f64) {
     let (source, reference) = (&registration.source.cloud, &registration.reference.cloud);
     let found = &registration.refinement.target_from_source;
     let (low, high) = source.bounds();
     let middle = rare::nalgebra::center(&low, &high);
     let place = |pose| PointCloud::to_local(reference, source, pose).apply(&middle);
-    format!(
-        "{:.3} degrees and {:.4} m",
-        found.error_to(initial).rotation_degrees,
-        (place(found) - place(initial)).norm()
-    )
+    (found.error_to(initial).rotation_degrees, (place(found) - place(initial)).norm())
 }
 
 /// The evidence by set and the time by step.

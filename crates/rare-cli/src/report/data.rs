@@ -220,7 +220,7 @@ fn transform(pose: &RigidTransform) -> Transform {
 fn verdict(registration: &Registration) -> VerdictInWords {
     let refinement = &registration.refinement;
     let likely = format!(
-        "The estimated probability that it is right is {:.0} %, from what the sensors, the surfaces and the correspondences say.",
+        "The estimated probability that it is right is {:.1} %, from what the sensors, the surfaces and the correspondences say.",
         100.0 * refinement.confidence
     );
     let (headline, explanation) = match registration.verdict() {
@@ -271,7 +271,8 @@ fn numbers(registration: &Registration) -> Vec<[String; 3]> {
         ),
     ];
     if let Some(initial) = &registration.initial {
-        let moved = summary::moved(registration, initial);
+        let (degrees, metres) = summary::moved(registration, initial);
+        let moved = format!("{degrees:.2}\u{b0}, {metres:.3} m");
         numbers.push(row(
             "moved",
             moved,
