@@ -43,11 +43,11 @@ function showMethods(data) {
     textColumn("name", "method"),
     numberColumn("pairs", "pairs", 0),
     numberColumn("solved", "solved", 0),
-    { ...numberColumn("share", "solved, %", 1), value: share, text: (method) => fixed(share(method), 1) },
-    numberColumn("mean_rotation", "mean rotation error, °", 2),
-    numberColumn("mean_translation", "mean translation error, m", 3),
+    { ...numberColumn("share", "solved (%)", 1), value: share, text: (method) => fixed(share(method), 1) },
+    numberColumn("mean_rotation", "mean rotation (°)", 2),
+    numberColumn("mean_translation", "mean translation (m)", 3),
   ];
-  const table = new SortableTable({ caption: "Means are over the pairs with a measured error.", columns, rows: data.methods, sort: null });
+  const table = new SortableTable({ caption: "Mean errors are over the pairs with a measured error.", columns, rows: data.methods, sort: null });
   section("methods").append(table.root);
 }
 
@@ -78,9 +78,9 @@ function pairColumns(limits) {
     textColumn("method", "method"),
     textColumn("scene", "scene"),
     { key: "pair", label: "source → reference", value: pairName, text: pairName, cell: pairCell },
-    numberColumn("rotation", "rotation, °", 2, "rotation error"),
-    numberColumn("translation", "translation, m", 3, "translation error"),
-    { ...numberColumn("overlap", "overlap, %", 1), text: (pair) => fixed(percent(pair.overlap), 1) },
+    numberColumn("rotation", "rotation (°)", 2, "rotation error"),
+    numberColumn("translation", "translation (m)", 3, "translation error"),
+    { ...numberColumn("overlap", "overlap (%)", 1), text: (pair) => fixed(percent(pair.overlap), 1) },
     numberColumn("confidence", "confidence", 3),
     { ...textColumn("verdict", "verdict"), text: (pair) => verdictNames[pair.verdict] ?? pair.verdict ?? "–", cell: null },
     numberColumn("seconds", "seconds", 2),

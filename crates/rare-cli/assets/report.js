@@ -12,7 +12,7 @@
 import { cloudColours } from "report/colours";
 import { residualHistogram, timingBars } from "report/charts";
 import { decodeCloud, decodeMatches } from "report/data";
-import { bindThemeButton, copyButton, count, element, fixed, metres, pageData, shortened } from "report/page";
+import { bindThemeButton, copyButton, count, element, fixed, pageData, shortened } from "report/page";
 import { SortableTable } from "report/tables";
 import { ViewImages } from "report/view-images";
 
@@ -77,7 +77,7 @@ function showSets(sets) {
     numberColumn("correspondences", "correspondences", (set) => set.correspondences, count),
     numberColumn("inliers", "inliers", (set) => set.inliers, count),
     numberColumn("share", "inlier share", share, (value) => (value === null ? "–" : `${fixed(100 * value, 1)} %`)),
-    numberColumn("residual", "median residual", (set) => set.median_residual, (value) => (value === null ? "–" : metres(value))),
+    numberColumn("residual", "median residual", (set) => set.median_residual, (value) => (value === null ? "–" : `${fixed(value, 3)} m`)),
   ];
   const caption = "Sets of correspondences; inliers and residuals under the resulting transform.";
   section("sets").append(sets.length > 0 ? new SortableTable({ caption, columns, rows: sets, sort: null }).root : nothing("No correspondences were recorded."));

@@ -47,6 +47,7 @@ function gather(bytes, start, count, planes) {
 
 /** The correspondences of a set: ends in the display frames of source and reference, split into inliers and outliers. */
 export function decodeMatches(set) {
+  if (set.shown === 0) return { inlier: new Float32Array(0), outlier: new Float32Array(0) };
   const bytes = blobBytes(set.blob);
   const count = set.shown;
   const ends = new Float32Array(bytes.buffer, bytes.byteOffset, count * 6);

@@ -52,7 +52,7 @@ export class ViewerPanel {
   describePicture() {
     const { canvas } = this.viewer;
     canvas.tabIndex = 0;
-    canvas.setAttribute("role", "img");
+    canvas.setAttribute("role", "application"); // it takes the arrow keys
     canvas.setAttribute("aria-label", "Source (orange) and reference (blue) in three dimensions; keys are listed under Keys");
     canvas.addEventListener("pointerdown", () => { canvas.focus({ preventScroll: true }); });
     canvas.addEventListener("focus", () => this.viewer.setZooming(true));

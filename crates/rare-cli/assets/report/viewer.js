@@ -12,6 +12,8 @@ import { lineShader, pointShader, shadeShader } from "report/shaders";
 export const colourModes = ["cloud", "residual", "visibility"];
 /** A fine picture has this many samples across and down each of its pixels. */
 const fineSamples = 2;
+/** Pixels across of a saved picture. */
+const printWidth = 2400;
 const lineStyles = {
   inlier: { width: 1.5, opacity: 0.75, dash: 0 },
   outlier: { width: 1.1, opacity: 0.6, dash: 9 },
@@ -132,10 +134,9 @@ export class Viewer {
     new ResizeObserver(() => this.resize()).observe(this.container);
   }
 
-  resize() {
+  resize(ratio = Math.min(window.devicePixelRatio || 1, 2)) {
     const width = Math.max(this.container.clientWidth, 1);
     const height = Math.max(this.container.clientHeight, 1);
-    const ratio = Math.min(window.devicePixelRatio || 1, 2);
     this.renderer.setPixelRatio(ratio);
     this.renderer.setSize(width, height);
     const pixels = this.renderer.getDrawingBufferSize(new THREE.Vector2());
@@ -308,10 +309,13 @@ export class Viewer {
     return { width, height, data };
   }
 
-  /** The picture as a PNG. */
-  picture() {
+  /** The picture as a PNG, wide enough for print. */
+  async picture() {
+    this.resize(Math.min(Math.max(printWidth / this.container.clientWidth, window.devicePixelRatio || 1), 4));
     this.render();
-    return new Promise((resolve) => { this.canvas.toBlob(resolve, "image/png"); });
+    const blob = await new Promise((resolve) => { this.canvas.toBlob(resolve, "image/png"); });
+    this.resize();
+    return blob;
   }
 }
 

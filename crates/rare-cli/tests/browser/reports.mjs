@@ -3,11 +3,12 @@
 //   node reports.mjs [--screenshots FOLDER] [--limit SECONDS] REPORT.html ...
 //
 // The browser is $CHROMIUM or /usr/bin/chromium. A page with the section of the viewer is checked as the report of a
-// registration, any other as the index of an evaluation. Ends with 1 and a message at the first failure.
+// registration, any other as the index of an evaluation. Ends with 1 and a message at the first failure; skips, and says
+// so, where there is no browser and $CHROMIUM is not set.
 
-import { mkdirSync } from "node:fs";
+import { existsSync, mkdirSync } from "node:fs";
 import { basename, join, resolve } from "node:path";
-import { pathToFileURL } from "node:url";
+import { fileURLToPath, pathToFileURL } from "node:url";
 
 import { chromium } from "playwright-core";
 
@@ -89,10 +90,27 @@ async function checkViewer(page) {
   await moveSlider(page, "Blend between poses", 0.3);
   const blended = await differs(page, toggled, "the slider");
   demand(blended.sum !== first.sum, "the slider does not change the picture");
+  await page.keyboard.press("ArrowLeft");
+  await differs(page, blended, "an arrow key");
   await page.keyboard.press("t");
   await checkColours(page);
   await checkPresets(page);
   await checkLines(page);
+  await checkRest(page);
+}
+
+/** Nothing may be drawn while nothing changes. */
+async function checkRest(page) {
+  await page.waitForTimeout(600);
+  const frames = await page.evaluate(async () => {
+    const request = window.requestAnimationFrame;
+    let calls = 0;
+    window.requestAnimationFrame = (callback) => { calls += 1; return request.call(window, callback); };
+    await new Promise((done) => { setTimeout(done, 500); });
+    window.requestAnimationFrame = request;
+    return calls;
+  });
+  demand(frames === 0, `the viewer asks for ${frames} frames in half a second of rest`);
 }
 
 async function moveSlider(page, label, share) {
@@ -267,6 +285,8 @@ async function checkLinks(page, data) {
   const links = await page.locator("#pairs tbody a").evaluateAll((anchors) => anchors.map((anchor) => anchor.getAttribute("href")));
   const wanted = data.pairs.map((pair) => pair.page).filter(Boolean);
   demand(links.sort().join("\n") === wanted.sort().join("\n"), "the links are not those of the data");
+  const addresses = await page.locator("#pairs tbody a").evaluateAll((anchors) => anchors.map((anchor) => anchor.href));
+  for (const address of addresses) demand(existsSync(fileURLToPath(address)), `the page ${address} does not exist`);
 }
 
 // ---- pictures
@@ -297,7 +317,12 @@ async function check(browser, file, options) {
 
 async function main() {
   const options = readArguments(process.argv.slice(2));
-  const browser = await chromium.launch({ executablePath: process.env.CHROMIUM ?? "/usr/bin/chromium", headless: true, args: browserArguments });
+  const executablePath = process.env.CHROMIUM ?? "/usr/bin/chromium";
+  if (!process.env.CHROMIUM && !existsSync(executablePath)) {
+    console.log(`skipped: no browser at ${executablePath}; set CHROMIUM to another one`);
+    return;
+  }
+  const browser = await chromium.launch({ executablePath, headless: true, args: browserArguments });
   try {
     for (const file of options.files) {
       await check(browser, file, options).catch((error) => { throw new Failure(`${file}: ${error.message}`); });
