@@ -7,6 +7,7 @@
 //   blend(value)    shows it between the poses: 0 the first, 1 the second, ...
 //   setColour(mode) "cloud", "residual" or "visibility"
 //   lookFrom(name)  "fit", "top", "reference" or "source"
+//   pullApart(share) moves the source aside, 0 to 1; showSet(index, shown) draws a set of correspondences
 //   pixels()        draws and reads back { width, height, data }: RGBA bytes, rows from the bottom
 
 import { cloudColours } from "report/colours";
@@ -163,6 +164,8 @@ function exposeForTests(panel) {
     blend: (value) => panel.blend(value),
     setColour: (mode) => panel.setColour(mode),
     lookFrom: (preset) => panel.viewer.lookFrom(preset),
+    pullApart: (share) => panel.pullApart(share),
+    showSet: (index, shown) => panel.showSet(index, shown),
     pixels: () => panel.viewer.pixels(),
   });
 }

@@ -15,11 +15,11 @@ export function matrixOf(rows) {
   return new Matrix4().set(...rows.flat());
 }
 
-/** A few thousand points of a cloud, moved by `pose`, without the outermost: stray points would make the scene tiny. */
-export function samplePoints(cloud, pose) {
+/** A few thousand points of a cloud, without the outermost: stray points would make the scene tiny. */
+export function samplePoints(cloud) {
   const step = Math.max(1, Math.floor(cloud.count / 4000));
   const points = [];
-  for (let index = 0; index < cloud.count; index += step) points.push(pointOf(cloud, index).applyMatrix4(pose));
+  for (let index = 0; index < cloud.count; index += step) points.push(pointOf(cloud, index));
   const box = innerBox(points);
   const inside = points.filter((point) => box.containsPoint(point));
   return inside.length > 0 ? inside : [new Vector3()];
@@ -81,53 +81,31 @@ export class CameraPresets {
     return forward.lengthSq() > 1e-6 ? forward.normalize() : sideways(this.up);
   }
 
-  /** From behind and above, with everything in the picture. */
-  fit(aspect) {
+  /** From behind and above, with all `points` (by default both clouds) in the picture. */
+  fit(aspect, points) {
     const forward = this.levelForward();
     const side = new Vector3().crossVectors(forward, this.up);
     const height = this.kind === "lidar" ? 0.9 : 0.5;
     const away = forward.clone().negate().addScaledVector(this.up, height).addScaledVector(side, 0.45).normalize();
-    return this.from(away, aspect);
+    return this.from(away, aspect, points);
   }
 
   /** From above; what the reference's sensor faced is at the top of the picture. */
-  top(aspect) {
+  top(aspect, points) {
     const away = this.up.clone().addScaledVector(this.levelForward(), -1e-3).normalize();
-    return this.from(away, aspect);
+    return this.from(away, aspect, points);
   }
 
-  /** From the direction `away`, just so far that all sampled points are in the picture. */
-  from(away, aspect) {
-    const right = new Vector3().crossVectors(this.up, away).normalize();
-    const above = new Vector3().crossVectors(away, right);
+  /** From the direction `away`, just so far that all points are in the picture. */
+  from(away, aspect, points = this.points) {
     const half = Math.tan((usualAngle * Math.PI) / 360) / fitMargin;
-    let target = this.centre.clone();
+    const right = new Vector3().crossVectors(this.up, away).normalize();
+    const lens = { away, right, above: new Vector3().crossVectors(away, right), high: half, wide: half * aspect };
+    let target = new Box3().setFromPoints(points).getCenter(new Vector3());
     // Twice: perspective shifts the middle of the picture away from the middle of the box.
-    for (let round = 0; round < 2; round += 1) target = this.middleInPicture(target, away, right, above, half, aspect);
-    const distance = this.distanceFor(target, away, right, above, half, aspect);
-    return { position: target.clone().addScaledVector(away, distance), target, up: this.up, angle: usualAngle };
-  }
-
-  distanceFor(target, away, right, above, half, aspect) {
-    return this.points.reduce((most, point) => {
-      const offset = point.clone().sub(target);
-      const side = Math.max(Math.abs(offset.dot(right)) / (half * aspect), Math.abs(offset.dot(above)) / half);
-      return Math.max(most, side + offset.dot(away));
-    }, 1e-3);
-  }
-
-  middleInPicture(target, away, right, above, half, aspect) {
-    const distance = this.distanceFor(target, away, right, above, half, aspect);
-    const places = this.points.map((point) => {
-      const offset = point.clone().sub(target);
-      const depth = Math.max(distance - offset.dot(away), 1e-6);
-      return [offset.dot(right) / depth, offset.dot(above) / depth];
-    });
-    const middle = [0, 1].map((axis) => {
-      const values = places.map((place) => place[axis]);
-      return (Math.min(...values) + Math.max(...values)) / 2;
-    });
-    return target.clone().addScaledVector(right, middle[0] * distance).addScaledVector(above, middle[1] * distance);
+    for (let round = 0; round < 2; round += 1) target = middleInPicture(points, target, lens);
+    const position = target.clone().addScaledVector(away, distanceFor(points, target, lens));
+    return { position, target, up: this.up, angle: usualAngle };
   }
 
   /** As the sensor of a cloud saw it; `pose` moves the cloud into the reference. Objects are seen from their front. */
@@ -145,6 +123,27 @@ export class CameraPresets {
     const away = this.levelForward().negate().addScaledVector(this.up, 0.3).transformDirection(pose);
     return this.from(away, aspect);
   }
+}
+
+/** How far from `target` a camera must stand to have all points in its picture. */
+function distanceFor(points, target, { away, right, above, high, wide }) {
+  return points.reduce((most, point) => {
+    const offset = point.clone().sub(target);
+    const side = Math.max(Math.abs(offset.dot(right)) / wide, Math.abs(offset.dot(above)) / high);
+    return Math.max(most, side + offset.dot(away));
+  }, 1e-3);
+}
+
+function middleInPicture(points, target, lens) {
+  const distance = distanceFor(points, target, lens);
+  const middle = [lens.right, lens.above].map((axis) => {
+    const places = points.map((point) => {
+      const offset = point.clone().sub(target);
+      return offset.dot(axis) / Math.max(distance - offset.dot(lens.away), 1e-6);
+    });
+    return ((Math.min(...places) + Math.max(...places)) / 2) * distance;
+  });
+  return target.clone().addScaledVector(lens.right, middle[0]).addScaledVector(lens.above, middle[1]);
 }
 
 function sideways(up) {

@@ -66,7 +66,7 @@ export class ViewerPanel {
     const last = this.poses.length - 1;
     this.poseBar = choiceBar("Pose of the source", "pose", choices, this.poses[last].key, (key) => this.setPose(key));
     this.poseSlider = slider("Blend between poses", { low: 0, high: last, step: 0.01, value: last, describe: (value) => this.poseText(value) }, (value) => this.blend(value));
-    this.apartSlider = slider("Pull clouds apart", { low: 0, high: 1, step: 0.01, value: 0 }, (value) => this.viewer.pullApart(value));
+    this.apartSlider = slider("Pull clouds apart", { low: 0, high: 1, step: 0.01, value: 0 }, (value) => this.pullApart(value));
     this.poseSlider.root.classList.add("full");
     return element("div", { class: "group" }, this.poseBar.root, this.poseSlider.root, this.apartSlider.root);
   }
@@ -139,8 +139,20 @@ export class ViewerPanel {
     this.blend(this.viewer.value === last ? last - 1 : last);
   }
 
+  pullApart(share) {
+    this.apartSlider.set(share);
+    this.viewer.pullApart(share);
+    this.describePose();
+  }
+
+  showSet(index, shown) {
+    const { input } = this.setBoxes[index];
+    if (input.checked !== shown) input.click();
+  }
+
   describePose() {
-    this.caption.textContent = `Source ${this.poseText(this.viewer.value)}`;
+    const apart = this.viewer.apart > 0 ? ", pulled apart" : "";
+    this.caption.textContent = `Source ${this.poseText(this.viewer.value)}${apart}`;
   }
 
   poseText(value) {
@@ -162,8 +174,8 @@ export class ViewerPanel {
   }
 
   toggleSets() {
-    const target = !this.setBoxes.some((box) => box.input.checked);
-    for (const box of this.setBoxes) if (box.input.checked !== target) box.input.click();
+    const shown = !this.setBoxes.some((box) => box.input.checked);
+    this.setBoxes.forEach((_, index) => this.showSet(index, shown));
   }
 
   changePointSize(steps) {

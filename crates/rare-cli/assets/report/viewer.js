@@ -46,12 +46,16 @@ export class Viewer {
   // ---- making
 
   makePresets(scene, clouds) {
-    const reference = samplePoints(clouds.reference, new THREE.Matrix4());
-    const sourceAt = (stop) => samplePoints(clouds.source, this.path.at(stop));
-    const final = new CameraPresets(scene, [...reference, ...sourceAt(this.path.last)]);
+    this.samples = { reference: samplePoints(clouds.reference), source: samplePoints(clouds.source) };
+    const { reference } = this.samples;
+    const final = new CameraPresets(scene, [...reference, ...this.sourceSample(this.path.at(this.path.last))]);
     // The pose before the last also has its place in the picture, unless it is so far off that all would look small.
-    const both = new CameraPresets(scene, [...final.points, ...sourceAt(this.path.last - 1)]);
+    const both = new CameraPresets(scene, [...final.points, ...this.sourceSample(this.path.at(this.path.last - 1))]);
     this.presets = both.radius < 1.5 * final.radius ? both : final;
+  }
+
+  sourceSample(pose) {
+    return this.samples.source.map((point) => point.clone().applyMatrix4(pose));
   }
 
   makeClouds(clouds) {
@@ -158,21 +162,36 @@ export class Viewer {
     this.moveSource();
   }
 
-  /** Moves the source aside by this share of the scene's size, to the right in the picture, so that lines can be seen. */
+  /**
+   * Moves the source aside by this share of the scene's size, to the left in the picture, so that the lines between
+   * aligned clouds can be seen; the camera steps back to keep both clouds in the picture.
+   */
   pullApart(share) {
     if (this.apart === 0) this.apartDirection.setFromMatrixColumn(this.camera.matrixWorld, 0);
     this.apart = share;
     this.moveSource();
+    const away = this.camera.position.clone().sub(this.controls.target).normalize();
+    this.placeCamera(this.presets.from(away, this.camera.aspect, this.framedPoints()));
   }
 
   moveSource() {
-    const offset = this.apartDirection.clone().multiplyScalar(-2 * this.apart * this.presets.radius);
-    const pose = new THREE.Matrix4().makeTranslation(offset).multiply(this.path.at(this.value));
+    const pose = this.sourcePose();
     const source = this.clouds.source;
     source.matrix.multiplyMatrices(pose, source.userData.unitToCloud);
     source.matrixWorldNeedsUpdate = true;
     this.lineShared.referenceFromSource.value.copy(pose);
     this.requestRender();
+  }
+
+  /** The pose as drawn: on the path, and pulled apart. */
+  sourcePose() {
+    const offset = this.apartDirection.clone().multiplyScalar(-1.6 * this.apart * this.presets.radius);
+    return new THREE.Matrix4().makeTranslation(offset).multiply(this.path.at(this.value));
+  }
+
+  /** What presets keep in the picture; undefined for their usual choice. */
+  framedPoints() {
+    return this.apart === 0 ? undefined : [...this.samples.reference, ...this.sourceSample(this.sourcePose())];
   }
 
   setColour(mode) {
@@ -216,7 +235,10 @@ export class Viewer {
 
   /** `preset`: "fit", "top", "reference" or "source". */
   lookFrom(preset) {
-    const view = this.presetView(preset);
+    this.placeCamera(this.presetView(preset));
+  }
+
+  placeCamera(view) {
     this.camera.up.copy(view.up);
     this.camera.fov = view.angle;
     this.camera.position.copy(view.position);
@@ -227,8 +249,8 @@ export class Viewer {
 
   presetView(preset) {
     const { aspect } = this.camera;
-    if (preset === "fit" || preset === "top") return this.presets[preset](aspect);
-    const pose = preset === "source" ? this.path.at(this.value) : new THREE.Matrix4();
+    if (preset === "fit" || preset === "top") return this.presets[preset](aspect, this.framedPoints());
+    const pose = preset === "source" ? this.sourcePose() : new THREE.Matrix4();
     return this.presets.sensor(pose, aspect);
   }
 

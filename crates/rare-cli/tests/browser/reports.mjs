@@ -76,7 +76,8 @@ async function differs(page, before, what) {
 }
 
 async function checkViewer(page) {
-  demand(await page.evaluate(() => window.rareReport.viewer) === "shown", "the viewer is missing: no WebGL");
+  const shown = await page.evaluate(() => window.rareReport.viewer) === "shown";
+  demand(shown, `the viewer is missing: ${await page.locator("#viewer").textContent()}`);
   const first = await picture(page);
   demand(first.colours > 10, `the picture has only ${first.colours} colours`);
   demand(first.covered > 0.01, `points cover only ${(100 * first.covered).toFixed(2)} % of the picture`);
@@ -144,6 +145,9 @@ async function checkLines(page) {
   await page.keyboard.press("l");
   await differs(page, before, "showing correspondences");
   await page.keyboard.press("l");
+  await moveSlider(page, "Pull clouds apart", 0.5);
+  await differs(page, before, "pulling the clouds apart");
+  await moveSlider(page, "Pull clouds apart", 0);
   await page.evaluate((last) => window.rareReport.blend(last), 99);
 }
 
@@ -299,10 +303,15 @@ async function takeScreenshots(browser, page, file, options) {
   await page.screenshot({ path: at("full"), fullPage: true });
   const viewer = page.locator("#viewer .picture");
   if (await viewer.count() > 0) await viewer.screenshot({ path: at("viewer") });
-  await page.emulateMedia({ colorScheme: "dark" });
-  await page.evaluate(() => new Promise((done) => { requestAnimationFrame(() => requestAnimationFrame(done)); }));
+  await chooseTheme(page, "dark");
   await page.screenshot({ path: at("dark"), fullPage: true });
-  await page.emulateMedia({ colorScheme: "light" });
+  await chooseTheme(page, "light");
+}
+
+/** The page hears of the change only with its next frame. */
+async function chooseTheme(page, colorScheme) {
+  await page.emulateMedia({ colorScheme });
+  await page.evaluate(() => new Promise((done) => { requestAnimationFrame(() => requestAnimationFrame(done)); }));
 }
 
 async function check(browser, file, options) {
