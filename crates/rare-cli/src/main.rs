@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 mod args;
+mod figures;
 mod images;
 mod memory;
 mod network;

@@ -1,0 +1,297 @@
+//! Clouds as images: points as discs before an orthographic camera, with a depth buffer and shading by depth.
+//!
+//! No normals are needed: a pixel is darkened by how far its neighbours stand before it (eye-dome lighting, Boucheny
+//! 2009), which draws edges and gives slanted surfaces another tone than those that face the camera.
+
+use rare::nalgebra::{Point3, Vector3};
+use rare::scale::SceneKind;
+
+use crate::figures::canvas::WHITE;
+use crate::images::Image;
+
+/// Pixels along each side of one of the image, so that edges are smooth.
+const FINER: usize = 2;
+/// Radii of discs, fine pixels.
+const SMALLEST: f64 = 1.3;
+const LARGEST: f64 = 9.0;
+/// Discs are that much larger than half the distance of points on average, to close surfaces.
+const CLOSING: f64 = 0.8;
+/// The side of the cells in which the density of points is counted, fine pixels.
+const CELL: usize = 12;
+/// How far apart the pixels are that shade one another, fine pixels.
+const SHADING_REACH: isize = 3;
+/// Steps in depth beyond this many times their distance in the image shade no more.
+const STEEPEST: f64 = 4.0;
+/// How dark the steepest step on all sides makes a pixel: the exponent.
+const DARKNESS: f64 = 1.5;
+
+/// A point to be drawn.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Dot {
+    pub(super) position: Point3<f64>,
+    pub(super) colour: [u8; 3],
+}
+
+/// The directions of an orthographic camera.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Look {
+    right: Vector3<f64>,
+    up: Vector3<f64>,
+    forward: Vector3<f64>,
+}
+
+impl Look {
+    /// From behind and above, turned a little so that walls show.
+    pub(super) fn oblique(kind: SceneKind) -> Look {
+        let (degrees_aside, degrees_down) = match kind {
+            SceneKind::Indoor => (24.0, 32.0),
+            SceneKind::Lidar => (30.0, 42.0),
+            SceneKind::Object => (35.0, 25.0),
+        };
+        Look::down(kind, degrees_aside, degrees_down)
+    }
+
+    /// From above; what lies ahead of the sensor is at the top.
+    pub(super) fn above(kind: SceneKind) -> Look {
+        Look::down(kind, 0.0, 90.0)
+    }
+
+    fn down(kind: SceneKind, degrees_aside: f64, degrees_down: f64) -> Look {
+        let (ahead, above) = match kind {
+            // The axes of a camera: z ahead, y down.
+            SceneKind::Indoor => (Vector3::z(), -Vector3::y()),
+            SceneKind::Lidar | SceneKind::Object => (Vector3::x(), Vector3::z()),
+        };
+        let (aside, down) = (f64::to_radians(degrees_aside), f64::to_radians(degrees_down));
+        let level = ahead * aside.cos() + above.cross(&ahead) * aside.sin();
+        let forward = level * down.cos() - above * down.sin();
+        let right = level.cross(&above);
+        Look { right, up: right.cross(&forward), forward }
+    }
+
+    /// To the right, upward and away from the camera, metres.
+    pub(super) fn seen(&self, point: &Point3<f64>) -> [f64; 3] {
+        [self.right, self.up, self.forward].map(|axis| axis.dot(&point.coords))
+    }
+}
+
+/// The part of the world that an image shows.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Frame {
+    /// To the right and upward as the camera sees it, metres.
+    pub(super) centre: [f64; 2],
+    pub(super) pixels_per_metre: f64,
+    pub(super) width: usize,
+    pub(super) height: usize,
+}
+
+/// The dots as the camera sees them on white.
+pub(super) fn render(dots: &[Dot], look: &Look, frame: &Frame) -> Image {
+    let mut buffer = Buffer::new(frame);
+    let seen: Vec<Seen> = dots.iter().filter_map(|dot| buffer.see(dot, look, frame)).collect();
+    let discs = offsets(buffer.radius(&seen));
+    for dot in &seen {
+        buffer.draw(dot, &discs);
+    }
+    buffer.shaded()
+}
+
+/// A dot in the image, fine pixels.
+struct Seen {
+    x: isize,
+    y: isize,
+    depth: f64,
+    colour: [u8; 3],
+}
+
+/// The nearest dot of every fine pixel.
+struct Buffer {
+    width: usize,
+    height: usize,
+    /// Fine pixels, as `x` and `y` are; infinite where nothing is.
+    depth: Vec<f64>,
+    colours: Vec<[u8; 3]>,
+}
+
+impl Buffer {
+    fn new(frame: &Frame) -> Buffer {
+        let (width, height) = (frame.width * FINER, frame.height * FINER);
+        let size = width * height;
+        Buffer { width, height, depth: vec![f64::INFINITY; size], colours: vec![WHITE; size] }
+    }
+
+    /// `None` outside of the image.
+    fn see(&self, dot: &Dot, look: &Look, frame: &Frame) -> Option<Seen> {
+        let [right, up, away] = look.seen(&dot.position);
+        let scale = frame.pixels_per_metre * FINER as f64;
+        let x = (right - frame.centre[0]) * scale + self.width as f64 / 2.0;
+        let y = (frame.centre[1] - up) * scale + self.height as f64 / 2.0;
+        let inside =
+            (0.0..self.width as f64).contains(&x) && (0.0..self.height as f64).contains(&y);
+        let depth = away * scale;
+        (inside && depth.is_finite()).then_some(Seen {
+            x: x as isize,
+            y: y as isize,
+            depth,
+            colour: dot.colour,
+        })
+    }
+
+    /// Half the distance of neighbouring dots on average, within bounds.
+    fn radius(&self, seen: &[Seen]) -> f64 {
+        let columns = self.width.div_ceil(CELL);
+        let mut taken = vec![false; columns * self.height.div_ceil(CELL)];
+        for dot in seen {
+            let cell = dot.y as usize / CELL * columns + dot.x as usize / CELL;
+            if let Some(taken) = taken.get_mut(cell) {
+                *taken = true;
+            }
+        }
+        let cells = taken.into_iter().filter(|&taken| taken).count();
+        let spacing = CELL as f64 * (cells as f64 / seen.len().max(1) as f64).sqrt();
+        (CLOSING * spacing).clamp(SMALLEST, LARGEST)
+    }
+
+    fn draw(&mut self, dot: &Seen, disc: &[[isize; 2]]) {
+        for [right, down] in disc {
+            let Some(pixel) = self.pixel(dot.x + right, dot.y + down) else { continue };
+            // Of equally near ones the first stays, whatever their order in memory became.
+            if self.depth.get(pixel).is_some_and(|&nearest| dot.depth < nearest) {
+                self.depth[pixel] = dot.depth;
+                self.colours[pixel] = dot.colour;
+            }
+        }
+    }
+
+    fn pixel(&self, x: isize, y: isize) -> Option<usize> {
+        let (x, y) = (usize::try_from(x).ok()?, usize::try_from(y).ok()?);
+        (x < self.width && y < self.height).then_some(y * self.width + x)
+    }
+
+    /// How much of its light a pixel keeps, 0 to 1.
+    fn light(&self, x: usize, y: usize, depth: f64) -> f64 {
+        let sides = [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, -1], [-1, 1], [1, 1]];
+        let mut before = 0.0;
+        for [right, down] in sides.map(|side: [isize; 2]| side.map(|step| step * SHADING_REACH)) {
+            let Some(pixel) = self.pixel(x as isize + right, y as isize + down) else { continue };
+            let steepness = (depth - self.depth[pixel]) / SHADING_REACH as f64;
+            // Where nothing is, the difference is minus infinity: it casts no shade.
+            before += steepness.clamp(0.0, STEEPEST) / STEEPEST;
+        }
+        (-DARKNESS * before / sides.len() as f64 * 2.0).exp()
+    }
+
+    /// The image of fine pixels, shaded, at its own size.
+    fn shaded(&self) -> Image {
+        let (width, height) = (self.width / FINER, self.height / FINER);
+        let pixels = (0..width * height).map(|pixel| {
+            let (x, y) = (pixel % width * FINER, pixel / width * FINER);
+            let mut sum = [0.0; 3];
+            for (right, down) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                let fine = (y + down) * self.width + x + right;
+                let depth = self.depth[fine];
+                let light =
+                    if depth.is_finite() { self.light(x + right, y + down, depth) } else { 1.0 };
+                let colour = self.colours[fine];
+                sum = std::array::from_fn(|channel| {
+                    sum[channel] + light * f64::from(colour[channel])
+                });
+            }
+            sum.map(|channel| (channel / (FINER * FINER) as f64).round() as u8)
+        });
+        Image { width, height, pixels: pixels.collect() }
+    }
+}
+
+/// The pixels of a disc around its middle.
+fn offsets(radius: f64) -> Vec<[isize; 2]> {
+    let reach = radius.ceil() as isize;
+    let inside = |[x, y]: &[isize; 2]| ((x * x + y * y) as f64) <= radius * radius;
+    let square = (-reach..=reach).flat_map(|y| (-reach..=reach).map(move |x| [x, y]));
+    square.filter(inside).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RED: [u8; 3] = [200, 0, 0];
+    const BLUE: [u8; 3] = [0, 0, 200];
+    const FRAME: Frame = Frame { centre: [0.0; 2], pixels_per_metre: 20.0, width: 60, height: 40 };
+
+    fn dots(points: &[[f64; 3]], colour: [u8; 3]) -> Vec<Dot> {
+        points.iter().map(|&position| Dot { position: position.into(), colour }).collect()
+    }
+
+    /// The colour of the middle.
+    fn middle(dots: &[Dot], look: &Look) -> [u8; 3] {
+        render(dots, look, &FRAME).pixels[20 * 60 + 30]
+    }
+
+    #[test]
+    fn a_cloud_nearer_to_the_camera_hides_the_farther_one() {
+        // Of a scanner z is up: from above the higher one is seen, from wherever it stands in the list.
+        let (low, high) = (dots(&[[0.0; 3]], RED), dots(&[[0.0, 0.0, 1.0]], BLUE));
+        let above = Look::above(SceneKind::Lidar);
+        assert_eq!(middle(&[low.clone(), high.clone()].concat(), &above), BLUE);
+        assert_eq!(middle(&[high, low].concat(), &above), BLUE);
+        // Of a camera y is down.
+        let (low, high) = (dots(&[[0.0, 1.0, 0.0]], RED), dots(&[[0.0; 3]], BLUE));
+        assert_eq!(middle(&[high, low].concat(), &Look::above(SceneKind::Indoor)), BLUE);
+    }
+
+    #[test]
+    fn looks_are_right_handed_and_what_is_ahead_is_above() {
+        for kind in [SceneKind::Indoor, SceneKind::Lidar, SceneKind::Object] {
+            for look in [Look::oblique(kind), Look::above(kind)] {
+                assert!((look.right.cross(&look.up) + look.forward).norm() < 1e-9);
+                assert!((look.right.norm() - 1.0).abs() < 1e-9);
+            }
+        }
+        let above = Look::above(SceneKind::Lidar);
+        assert!(
+            (above.up - Vector3::x()).norm() < 1e-9 && (above.right + Vector3::y()).norm() < 1e-9
+        );
+        let room = Look::oblique(SceneKind::Indoor);
+        assert!(room.up.y < -0.5 && room.forward.z > 0.5 && room.forward.y > 0.0);
+    }
+
+    #[test]
+    fn places_are_to_scale() {
+        // 20 pixels per metre: half a metre to the left (y of a scanner) is 10 pixels to the left.
+        let image = render(&dots(&[[0.0, 0.5, 0.0]], RED), &Look::above(SceneKind::Lidar), &FRAME);
+        let inked = (0..image.pixels.len()).filter(|&pixel| image.pixels[pixel] != WHITE);
+        let columns: Vec<usize> = inked.map(|pixel| pixel % 60).collect();
+        let mean = columns.iter().sum::<usize>() as f64 / columns.len() as f64;
+        assert!((mean - 20.0).abs() <= 0.5, "column {mean}");
+    }
+
+    #[test]
+    fn a_dense_surface_has_no_gaps_and_an_edge_casts_shade() {
+        let grid = |z: f64, from: i32, to: i32| -> Vec<[f64; 3]> {
+            let row = |x: i32| (-12..=12).map(move |y| [f64::from(x) * 0.1, f64::from(y) * 0.1, z]);
+            (from..=to).flat_map(row).collect()
+        };
+        let floor = dots(&grid(0.0, -12, 12), RED);
+        let above = Look::above(SceneKind::Lidar);
+        let image = render(&floor, &above, &FRAME);
+        let shown = (10..30).flat_map(|y| (10..50).map(move |x| y * 60 + x));
+        assert!(shown.clone().all(|pixel| image.pixels[pixel] == RED), "flat and closed");
+        let with_step = [floor, dots(&grid(1.0, 0, 12), RED)].concat();
+        let image = render(&with_step, &above, &FRAME);
+        assert!(shown.clone().any(|pixel| image.pixels[pixel][0] < 150), "the step is dark");
+    }
+
+    #[test]
+    fn hostile_dots_are_left_out() {
+        let odd = [[1e300, -1e300, 1e300], [f64::MAX; 3], [0.0, 0.0, 1e308], [0.0, 0.0, f64::MAX]];
+        let look = Look::oblique(SceneKind::Object);
+        render(&dots(&odd, RED), &look, &FRAME);
+        assert!(render(&[], &look, &FRAME).pixels.iter().all(|&pixel| pixel == WHITE));
+        for pixels_per_metre in [0.0, f64::INFINITY, f64::NAN, 1e-300] {
+            render(&dots(&odd, RED), &look, &Frame { pixels_per_metre, ..FRAME });
+        }
+        let nothing = Frame { width: 0, height: 0, ..FRAME };
+        assert!(render(&dots(&odd, RED), &look, &nothing).pixels.is_empty());
+    }
+}
