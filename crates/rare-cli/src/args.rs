@@ -172,13 +172,13 @@ pub(crate) struct FeaturesArgs {
 pub(crate) fn command() -> clap::Command {
     Cli::command()
         .mut_subcommand("features", |features| {
-            ["json", "save_aligned", "report", "depth_features", "verbose"]
+            ["json", "save_aligned", "report", "figures", "depth_features", "verbose"]
                 .into_iter()
                 .fold(features, |features, option| features.mut_arg(option, |arg| arg.hide(true)))
                 .mut_arg("output", |output| output.help("Write the features (NPZ)"))
         })
         .mut_subcommand("eval", |eval| {
-            ["json", "save_aligned", "depth_features", "verbose"]
+            ["json", "save_aligned", "figures", "depth_features", "verbose"]
                 .into_iter()
                 .fold(eval, |eval, option| eval.mut_arg(option, |arg| arg.hide(true)))
                 .mut_arg("output", |output| {
@@ -228,6 +228,9 @@ pub(crate) struct DemoArgs {
     /// Write a page (HTML) that shows what was done; opens in any browser, needs no network
     #[arg(long, value_name = "FILE")]
     pub(crate) report: Option<PathBuf>,
+    /// Draw figures (PNG, print resolution) into a folder, which is made if it does not exist
+    #[arg(long, value_name = "DIR")]
+    pub(crate) figures: Option<PathBuf>,
     /// Which room is simulated
     #[arg(long, value_name = "N", default_value_t = 0)]
     pub(crate) seed: u64,

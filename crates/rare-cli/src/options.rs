@@ -35,6 +35,10 @@ pub(crate) struct Options {
     /// Write a page (HTML) that shows what was done and whether to believe it; opens in any browser, needs no network
     #[arg(long, value_name = "FILE")]
     pub(crate) report: Option<PathBuf>,
+    /// Draw figures of depth maps, features, matches and clouds (PNG, print resolution) into a folder, which is made if
+    /// it does not exist
+    #[arg(long, value_name = "DIR")]
+    pub(crate) figures: Option<PathBuf>,
     /// The most accurate method, or the paper's recipe unchanged [default: default]
     #[arg(long, value_name = "PRESET", value_parser = choice::<Preset>(&["default", "paper"]))]
     pub(crate) preset: Option<Preset>,
@@ -127,6 +131,7 @@ pub(crate) struct Settings {
     pub(crate) json: Option<PathBuf>,
     pub(crate) save_aligned: Option<PathBuf>,
     pub(crate) report: Option<PathBuf>,
+    pub(crate) figures: Option<PathBuf>,
     pub(crate) config: Option<PathBuf>,
 }
 
@@ -185,6 +190,7 @@ impl Options {
             json: self.json,
             save_aligned: self.save_aligned,
             report: self.report,
+            figures: self.figures,
             config: self.config,
         })
     }
@@ -206,6 +212,7 @@ impl Options {
             json: self.json.or(other.json),
             save_aligned: self.save_aligned.or(other.save_aligned),
             report: self.report.or(other.report),
+            figures: self.figures.or(other.figures),
             preset: self.preset.or(other.preset),
             profile: self.profile.or(other.profile),
             camera: self.camera.or(other.camera),

@@ -41,6 +41,17 @@ pub(crate) fn check(inputs: &[&Path], outputs: &[Output<'_>]) -> Result<()> {
     Ok(())
 }
 
+/// Makes sure that files can be written into a folder, which may have to be made.
+///
+/// # Errors
+/// If there is a file of this name, or the folder that would hold it does not exist.
+pub(crate) fn check_folder(option: &'static str, folder: &Path) -> Result<()> {
+    if folder.is_file() {
+        bail!("{option} {}: this is a file: name a folder", folder.display());
+    }
+    if folder.is_dir() { Ok(()) } else { check_place(&Output { option, path: folder }) }
+}
+
 fn check_place(output: &Output<'_>) -> Result<()> {
     let Output { option, path } = output;
     if path.is_dir() {

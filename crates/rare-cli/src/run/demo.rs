@@ -26,6 +26,7 @@ pub(super) fn run(args: &DemoArgs) -> Result<u8> {
         output: Some(folder.join("result.txt")),
         json: Some(folder.join("result.json")),
         report: args.report.clone(),
+        figures: args.figures.clone(),
         quiet: Some(args.quiet),
         ..Options::default()
     }

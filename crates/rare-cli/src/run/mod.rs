@@ -26,7 +26,7 @@ use crate::args::{Cli, Clouds, Command, Direction};
 use crate::network::NetworkRecord;
 use crate::options::Settings;
 use crate::outputs::{self, Output};
-use crate::{NO_POSE, SUCCESS, record, report, summary};
+use crate::{NO_POSE, SUCCESS, figures, record, report, summary};
 
 /// Runs a command; gives the exit code.
 pub(crate) fn run(cli: Cli) -> Result<u8> {
@@ -109,10 +109,8 @@ impl Registration {
         if let Some(file) = &self.settings.json {
             files::write_whole(file, |writer| writer.write_all(json.as_bytes()))?;
         }
-        if let Some((file, illustration)) =
-            self.settings.report.as_ref().zip(self.illustration.as_ref())
-        {
-            report::write(file, self, illustration)?;
+        if let Some(illustration) = &self.illustration {
+            self.show(illustration)?;
         }
         if let Some(file) = &self.settings.save_aligned {
             files::write_cloud(file, &aligned(&self.source, &self.reference, pose))?;
@@ -122,6 +120,17 @@ impl Registration {
             self.say();
         }
         Ok(if self.verdict() == Verdict::Rejected { NO_POSE } else { SUCCESS })
+    }
+
+    /// Writes what people look at.
+    fn show(&self, illustration: &Illustration) -> Result<()> {
+        if let Some(file) = &self.settings.report {
+            report::write(file, self, illustration)?;
+        }
+        if let Some(folder) = &self.settings.figures {
+            figures::write_all(folder, self, illustration).context("--figures")?;
+        }
+        Ok(())
     }
 
     fn say(&self) {
@@ -149,6 +158,9 @@ fn check_outputs(settings: &Settings, inputs: &[&Path]) -> Result<()> {
     let configured = configured.into_iter().filter_map(Option::as_deref);
     let read: Vec<&Path> = inputs.iter().copied().chain(configured).collect();
     outputs::check(&read, &outputs)?;
+    if let Some(folder) = &settings.figures {
+        outputs::check_folder("--figures", folder)?;
+    }
     match &settings.save_aligned {
         Some(file) => files::check_writable_format(file).context("--save-aligned"),
         None => Ok(()),
@@ -181,7 +193,7 @@ fn illustration(
     refinement: &Refinement,
     settings: &Settings,
 ) -> rare::Result<Option<Illustration>> {
-    let asked = settings.report.is_some();
+    let asked = settings.report.is_some() || settings.figures.is_some();
     asked.then(|| report::illustrate(refiner, scans, initial, refinement)).transpose()
 }
 
