@@ -15,26 +15,26 @@ export function matrixOf(rows) {
   return new Matrix4().set(...rows.flat());
 }
 
-/** A few thousand points of a cloud, without the outermost: stray points would make the scene tiny. */
-export function samplePoints(cloud) {
+/** A few thousand points of a cloud, without the outermost share along each axis: stray points would make the scene tiny. */
+export function samplePoints(cloud, outermost) {
   const step = Math.max(1, Math.floor(cloud.count / 4000));
   const points = [];
   for (let index = 0; index < cloud.count; index += step) points.push(pointOf(cloud, index));
-  const box = innerBox(points);
+  const box = innerBox(points, outermost);
   const inside = points.filter((point) => box.containsPoint(point));
   return inside.length > 0 ? inside : [new Vector3()];
 }
 
-function innerBox(points) {
-  const ranges = [0, 1, 2].map((axis) => innerRange(points.map((point) => point.getComponent(axis))));
+function innerBox(points, outermost) {
+  const ranges = [0, 1, 2].map((axis) => innerRange(points.map((point) => point.getComponent(axis)), outermost));
   return new Box3(new Vector3(...ranges.map(([low]) => low)), new Vector3(...ranges.map(([, high]) => high)));
 }
 
-function innerRange(values) {
+function innerRange(values, outermost) {
   if (values.length === 0) return [0, 1];
   values.sort((a, b) => a - b);
   const at = (share) => values[Math.round(share * (values.length - 1))];
-  return [at(0.005), at(0.995)];
+  return [at(outermost), at(1 - outermost)];
 }
 
 /** One point of a decoded cloud, in its display frame. */

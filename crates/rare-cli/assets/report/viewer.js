@@ -46,7 +46,8 @@ export class Viewer {
   // ---- making
 
   makePresets(scene, clouds) {
-    this.samples = { reference: samplePoints(clouds.reference), source: samplePoints(clouds.source) };
+    const outermost = scene.kind === "lidar" ? 0.04 : 0.005; // a rotating scanner's far points are few and lone
+    this.samples = { reference: samplePoints(clouds.reference, outermost), source: samplePoints(clouds.source, outermost) };
     const { reference } = this.samples;
     const final = new CameraPresets(scene, [...reference, ...this.sourceSample(this.path.at(this.path.last))]);
     // The pose before the last also has its place in the picture, unless it is so far off that all would look small.
@@ -313,7 +314,7 @@ export class Viewer {
     const ratio = this.renderer.getPixelRatio();
     const { uniforms } = this.shade;
     this.shared.pixelsPerUnit.value = target.height / (2 * Math.tan((this.camera.fov * Math.PI) / 360));
-    this.shared.smallest.value = 1.6 * ratio * samples;
+    this.shared.smallest.value = 1.9 * ratio * samples;
     uniforms.colours.value = target.texture;
     uniforms.depths.value = target.depthTexture;
     uniforms.pixel.value.set(1 / target.width, 1 / target.height);
