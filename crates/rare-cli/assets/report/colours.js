@@ -35,9 +35,9 @@ export function viridis(value) {
   return low.map((channel, index) => Math.round(channel + (high[index] - channel) * (place - before)));
 }
 
-/** Viridis as a CSS gradient, low values on the left. */
-export function viridisGradient() {
-  return `linear-gradient(to right, ${viridisStops.join(", ")})`;
+/** Viridis as a CSS gradient that grows towards a side. */
+export function viridisGradient(side = "right") {
+  return `linear-gradient(to ${side}, ${viridisStops.join(", ")})`;
 }
 
 /** 256 RGBA entries: residual bytes to colours. */

@@ -124,7 +124,7 @@ function maskLegend() {
 }
 
 function depthLegend([near, far]) {
-  const bar = element("span", { class: "ramp", style: `background:${viridisGradient()}` });
+  const bar = element("span", { class: "ramp", style: `background:${viridisGradient("left")}` });
   return element("p", { class: "depth-legend" }, element("span", { text: `Depth ${metres(near)}` }), bar, element("span", { text: metres(far) }));
 }
 
