@@ -123,7 +123,9 @@ function maskLegend() {
   return element("p", { class: "mask-legend" }, element("span", { text: "Agreement: " }), ...entries);
 }
 
-function depthLegend([near, far]) {
+function depthLegend(range) {
+  if (!range) return element("p", { class: "depth-legend", text: "Neither cloud is seen in this view." });
+  const [near, far] = range;
   const bar = element("span", { class: "ramp", style: `background:${viridisGradient("left")}` });
   return element("p", { class: "depth-legend" }, element("span", { text: `Depth ${metres(near)}` }), bar, element("span", { text: metres(far) }));
 }

@@ -26,6 +26,7 @@ use crate::args::{Cli, Clouds, Command, Direction};
 use crate::network::NetworkRecord;
 use crate::options::Settings;
 use crate::outputs::{self, Output};
+use crate::progress::Progress;
 use crate::{NO_POSE, SUCCESS, figures, record, report, summary};
 
 /// Runs a command; gives the exit code.
@@ -124,10 +125,13 @@ impl Registration {
 
     /// Writes what people look at.
     fn show(&self, illustration: &Illustration) -> Result<()> {
+        let progress = Progress::start(self.settings.quiet);
         if let Some(file) = &self.settings.report {
+            progress.step("report");
             report::write(file, self, illustration)?;
         }
         if let Some(folder) = &self.settings.figures {
+            progress.step("figures");
             figures::write_all(folder, self, illustration).context("--figures")?;
         }
         Ok(())
