@@ -7,7 +7,7 @@ use rare::scale::SceneKind;
 use rayon::prelude::*;
 
 use crate::figures::canvas::{Area, Canvas};
-use crate::figures::clouds::{self, Darkness, Dot, Frame, Look};
+use crate::figures::clouds::{self, Darkness, Dot, Frame, Look, Style};
 use crate::figures::layout::{self, LINE, MARGIN, WIDTH};
 use crate::figures::{Pose, REFERENCE, SOURCE, Subject};
 
@@ -90,6 +90,23 @@ impl Row {
         }
     }
 
+    fn frame(&self, area: Area, scale: f64) -> Frame {
+        let [low, high] = self.bounds;
+        Frame {
+            centre: std::array::from_fn(|axis| low[axis] / 2.0 + high[axis] / 2.0),
+            pixels_per_metre: scale,
+            width: area.width as usize,
+            height: area.height as usize,
+        }
+    }
+
+    /// Of the dots of all panels, so that nothing but the transform tells them apart.
+    fn radius(&self, subject: &Subject<'_>, frame: &Frame) -> f64 {
+        let source = subject.poses.last().map(|pose| source(subject, pose)).unwrap_or_default();
+        let radius = |dots: &[Dot]| clouds::closing_radius(dots, &self.look, frame);
+        radius(&reference(subject)).max(radius(&source))
+    }
+
     fn draw(
         &self,
         subject: &Subject<'_>,
@@ -98,15 +115,12 @@ impl Row {
         scale: f64,
         first: usize,
     ) {
-        let [low, high] = self.bounds;
+        let frame = |area: &Area| self.frame(*area, scale);
+        let radius = areas.first().map_or(1.0, |area| self.radius(subject, &frame(area)));
+        let style = Style { radius, darkness: Darkness::DEEP };
         let panels = areas.par_iter().zip(&subject.poses).map(|(area, pose)| {
-            let frame = Frame {
-                centre: std::array::from_fn(|axis| low[axis] / 2.0 + high[axis] / 2.0),
-                pixels_per_metre: scale,
-                width: area.width as usize,
-                height: area.height as usize,
-            };
-            clouds::render(&dots(subject, pose), &self.look, &frame, Darkness::DEEP)
+            let dots = [reference(subject), source(subject, pose)].concat();
+            clouds::render(&dots, &self.look, &frame(area), style)
         });
         let panels: Vec<_> = panels.collect();
         for (index, ((area, image), pose)) in
@@ -121,11 +135,14 @@ impl Row {
     }
 }
 
-fn dots(subject: &Subject<'_>, pose: &Pose) -> Vec<Dot> {
-    let reference = evenly(subject.reference, MOST_POINTS);
-    let reference = reference.map(|&position| Dot { position, colour: REFERENCE });
-    let source = evenly(subject.source, MOST_POINTS).map(|point| pose.local.apply(point));
-    reference.chain(source.map(|position| Dot { position, colour: SOURCE })).collect()
+fn reference(subject: &Subject<'_>) -> Vec<Dot> {
+    let points = evenly(subject.reference, MOST_POINTS);
+    points.map(|&position| Dot { position, colour: REFERENCE }).collect()
+}
+
+fn source(subject: &Subject<'_>, pose: &Pose) -> Vec<Dot> {
+    let points = evenly(subject.source, MOST_POINTS).map(|point| pose.local.apply(point));
+    points.map(|position| Dot { position, colour: SOURCE }).collect()
 }
 
 /// Some points of both clouds under a pose.

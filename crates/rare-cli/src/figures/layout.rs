@@ -20,7 +20,7 @@ const SMALL_POINTS: f32 = 7.5;
 /// Text is made smaller rather than cut off, but not below this share of its size.
 const SMALLEST: f32 = 0.6;
 /// What a colour bar takes beside its row, pixels.
-pub(super) const COLOUR_BAR: f32 = 165.0;
+pub(super) const COLOUR_BAR: f32 = 185.0;
 /// What a line of captions or of a legend takes, pixels.
 pub(super) const LINE: f32 = 66.0;
 /// From one line of a caption to the next, by the size of the text.
@@ -207,7 +207,7 @@ impl ColourBar<'_> {
         if self.open {
             let room = 1.2 * f64::from(small_size() / bar.height) * (high - low);
             marks.retain(|(value, _)| *value < high - room);
-            marks.push((high, format!("≥ {high:.2}")));
+            marks.push((high, format!("≥{high:.2}")));
         }
         let last = marks.len().saturating_sub(1);
         for (index, (value, words)) in marks.into_iter().enumerate() {

@@ -114,7 +114,7 @@ fn draw_panels(canvas: &mut Canvas, grid: &Grid, panels: &[Panel]) {
     }
 }
 
-/// The share of what both clouds show in a mask that agrees.
+/// The shares of what is comparable in a mask that agree and do not.
 fn agreement(mask: &VisibilityMask) -> String {
     let count =
         |kinds: &[Visibility]| mask.pixels.iter().filter(|kind| kinds.contains(kind)).count();
@@ -122,7 +122,10 @@ fn agreement(mask: &VisibilityMask) -> String {
     let against = count(&[Visibility::Violation, Visibility::GrossViolation]);
     match agree + against {
         0 => "nothing in common".to_owned(),
-        all => format!("{:.0} % agree", 100.0 * agree as f64 / all as f64),
+        all => {
+            let share = |count: usize| 100.0 * count as f64 / all as f64;
+            format!("{:.1} % agree, {:.1} % violate", share(agree), share(against))
+        }
     }
 }
 

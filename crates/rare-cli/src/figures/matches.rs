@@ -30,7 +30,7 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
         let both = Area { width: right.right() - left.x, ..left };
         layout::caption(&mut canvas, both, index, &words);
     }
-    let entries = [(INLIER, "agrees with the result"), (OUTLIER, "does not")];
+    let entries = [(INLIER, "inlier of the result"), (OUTLIER, "outlier")];
     layout::legend(&mut canvas, grid.bottom(), &entries);
     Ok(canvas)
 }

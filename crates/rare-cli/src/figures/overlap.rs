@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use crate::figures::alignment;
 use crate::figures::canvas::Canvas;
-use crate::figures::clouds::{self, Darkness, Dot, Frame, Look};
+use crate::figures::clouds::{self, Darkness, Dot, Frame, Look, Style};
 use crate::figures::layout::{self, ColourBar, Grid, LINE, Room};
 use crate::figures::{Pose, Subject};
 use crate::images::{AGREE, OCCLUDED, VIOLATION, viridis};
@@ -44,7 +44,9 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
         return layout::message("no point was judged");
     };
     let mut canvas = grid.sheet(LINE)?;
-    let images = panels.par_iter().map(|dots| clouds::render(dots, &look, &frame, Darkness::FAINT));
+    let radius = clouds::closing_radius(&panels[0], &look, &frame);
+    let style = Style { radius, darkness: Darkness::FAINT };
+    let images = panels.par_iter().map(|dots| clouds::render(dots, &look, &frame, style));
     let images: Vec<_> = images.collect();
     let captions = ["result, what the sensors say", "result, distance from the other cloud"];
     for (index, (image, caption)) in images.iter().zip(captions).enumerate() {
