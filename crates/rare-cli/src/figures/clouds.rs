@@ -133,8 +133,8 @@ pub(super) fn render(dots: &[Dot], look: &Look, frame: &Frame, style: Style) -> 
     buffer.image(&buffer.light(style.darkness))
 }
 
-/// The radius of discs that close the surfaces of a cloud, fine pixels: from the usual distance of neighbouring dots,
-/// that in the cell of median density.
+/// The radius of discs that close the surfaces of a cloud, fine pixels: from the usual distance of neighbouring dots
+/// where they are rather sparse, that in the cell of the lower quartile of densities.
 pub(super) fn closing_radius(dots: &[Dot], look: &Look, frame: &Frame) -> f64 {
     let [columns, rows] = frame.fine().map(|pixels| pixels.div_ceil(CELL));
     let mut counts = vec![0_usize; columns * rows];
@@ -146,7 +146,7 @@ pub(super) fn closing_radius(dots: &[Dot], look: &Look, frame: &Frame) -> f64 {
     }
     counts.retain(|&count| count > 0);
     counts.sort_unstable();
-    let usual = counts.get(counts.len() / 2).copied().unwrap_or(1);
+    let usual = counts.get(counts.len() / 4).copied().unwrap_or(1);
     (CLOSING * CELL as f64 / (usual as f64).sqrt()).clamp(SMALLEST, LARGEST)
 }
 
