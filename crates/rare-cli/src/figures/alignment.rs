@@ -3,10 +3,11 @@
 use anyhow::Result;
 use rare::PointCloud;
 use rare::nalgebra::Point3;
+use rare::scale::SceneKind;
 use rayon::prelude::*;
 
 use crate::figures::canvas::{Area, Canvas};
-use crate::figures::clouds::{self, Dot, Frame, Look};
+use crate::figures::clouds::{self, Darkness, Dot, Frame, Look, Style};
 use crate::figures::layout::{self, LINE, MARGIN, WIDTH};
 use crate::figures::{Pose, REFERENCE, SOURCE, Subject};
 
@@ -14,8 +15,6 @@ use crate::figures::{Pose, REFERENCE, SOURCE, Subject};
 const MOST_POINTS: usize = 600_000;
 /// Points by which the part of the world is chosen that is shown.
 const MOST_BOUNDS_POINTS: usize = 20_000;
-/// The share of points on each side that may lie outside of the frame.
-const OUTLYING: f64 = 0.005;
 /// What is free around the points, as a share of their extent.
 const BORDER: f64 = 0.03;
 /// A panel shows at most that many times the extent of the aligned clouds: clouds that start far apart are cut off.
@@ -45,6 +44,7 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
         row.draw(subject, &mut canvas, &areas, scale, number * columns);
         y += height + LINE;
     }
+    layout::scale_bar(&mut canvas, y, scale);
     layout::legend(&mut canvas, y, &[(SOURCE, "source"), (REFERENCE, "reference")]);
     Ok(canvas)
 }
@@ -60,7 +60,7 @@ struct Row {
 
 impl Row {
     fn new(subject: &Subject<'_>, look: Look) -> Row {
-        let bounds = |pose: &Pose| bounds(&look, &few(subject, pose));
+        let bounds = |pose: &Pose| bounds(&look, outlying(subject.kind), &few(subject, pose));
         let of_poses: Vec<Option<Bounds>> = subject.poses.iter().map(bounds).collect();
         let result = of_poses.last().copied().flatten().unwrap_or([[-1.0; 2], [1.0; 2]]);
         let all = of_poses.iter().flatten().fold(result, |all, bounds| union(all, *bounds));
@@ -90,6 +90,23 @@ impl Row {
         }
     }
 
+    fn frame(&self, area: Area, scale: f64) -> Frame {
+        let [low, high] = self.bounds;
+        Frame {
+            centre: std::array::from_fn(|axis| low[axis] / 2.0 + high[axis] / 2.0),
+            pixels_per_metre: scale,
+            width: area.width as usize,
+            height: area.height as usize,
+        }
+    }
+
+    /// Of the dots of all panels, so that nothing but the transform tells them apart.
+    fn radius(&self, subject: &Subject<'_>, frame: &Frame) -> f64 {
+        let source = subject.poses.last().map(|pose| source(subject, pose)).unwrap_or_default();
+        let radius = |dots: &[Dot]| clouds::closing_radius(dots, &self.look, frame);
+        radius(&reference(subject)).max(radius(&source))
+    }
+
     fn draw(
         &self,
         subject: &Subject<'_>,
@@ -98,15 +115,12 @@ impl Row {
         scale: f64,
         first: usize,
     ) {
-        let [low, high] = self.bounds;
+        let frame = |area: &Area| self.frame(*area, scale);
+        let radius = areas.first().map_or(1.0, |area| self.radius(subject, &frame(area)));
+        let style = Style { radius, darkness: Darkness::DEEP };
         let panels = areas.par_iter().zip(&subject.poses).map(|(area, pose)| {
-            let frame = Frame {
-                centre: std::array::from_fn(|axis| low[axis] / 2.0 + high[axis] / 2.0),
-                pixels_per_metre: scale,
-                width: area.width as usize,
-                height: area.height as usize,
-            };
-            clouds::render(&dots(subject, pose), &self.look, &frame)
+            let dots = [reference(subject), source(subject, pose)].concat();
+            clouds::render(&dots, &self.look, &frame(area), style)
         });
         let panels: Vec<_> = panels.collect();
         for (index, ((area, image), pose)) in
@@ -118,17 +132,17 @@ impl Row {
             let note = if whole { "" } else { " (partly outside)" };
             layout::caption(canvas, *area, first + index, &format!("{}{note}", pose.name));
         }
-        if let Some(area) = areas.first() {
-            layout::scale_bar(canvas, *area, scale);
-        }
     }
 }
 
-fn dots(subject: &Subject<'_>, pose: &Pose) -> Vec<Dot> {
-    let reference = evenly(subject.reference, MOST_POINTS);
-    let reference = reference.map(|&position| Dot { position, colour: REFERENCE });
-    let source = evenly(subject.source, MOST_POINTS).map(|point| pose.local.apply(point));
-    reference.chain(source.map(|position| Dot { position, colour: SOURCE })).collect()
+fn reference(subject: &Subject<'_>) -> Vec<Dot> {
+    let points = evenly(subject.reference, MOST_POINTS);
+    points.map(|&position| Dot { position, colour: REFERENCE }).collect()
+}
+
+fn source(subject: &Subject<'_>, pose: &Pose) -> Vec<Dot> {
+    let points = evenly(subject.source, MOST_POINTS).map(|point| pose.local.apply(point));
+    points.map(|position| Dot { position, colour: SOURCE }).collect()
 }
 
 /// Some points of both clouds under a pose.
@@ -141,15 +155,20 @@ fn evenly(cloud: &PointCloud, most: usize) -> impl Iterator<Item = &Point3<f64>>
     cloud.points().iter().step_by(cloud.len().div_ceil(most).max(1))
 }
 
+/// The share of points on each side that may lie outside of the frame. A rotating scanner sees some far away.
+pub(super) fn outlying(kind: SceneKind) -> f64 {
+    if kind == SceneKind::Lidar { 0.03 } else { 0.001 }
+}
+
 /// The rectangle that holds nearly all points; `None` if there is none.
-pub(super) fn bounds(look: &Look, points: &[Point3<f64>]) -> Option<Bounds> {
+pub(super) fn bounds(look: &Look, outlying: f64, points: &[Point3<f64>]) -> Option<Bounds> {
     let seen: Vec<[f64; 3]> = points.iter().map(|point| look.seen(point)).collect();
     let range = |axis: usize| {
         let mut values: Vec<f64> = seen.iter().map(|place| place[axis]).collect();
         values.retain(|value| value.is_finite());
         values.sort_by(f64::total_cmp);
         let last = values.len().checked_sub(1)?;
-        let cut = (OUTLYING * last as f64) as usize;
+        let cut = (outlying * last as f64) as usize;
         Some([*values.get(cut)?, *values.get(last - cut)?])
     };
     let (right, up) = (range(0)?, range(1)?);
@@ -182,8 +201,6 @@ fn limited(all: Bounds, main: Bounds) -> Bounds {
 
 #[cfg(test)]
 mod tests {
-    use rare::scale::SceneKind;
-
     use super::*;
 
     #[test]
@@ -194,10 +211,10 @@ mod tests {
             .map(|i| Point3::new(f64::from(i) * 0.01, f64::from(i) * 0.002, 0.0))
             .collect();
         points.push(Point3::new(900.0, -900.0, 0.0));
-        let [low, high] = bounds(&look, &points).unwrap();
+        let [low, high] = bounds(&look, 0.005, &points).unwrap();
         assert!((high[1] - low[1] - 9.9).abs() < 0.2, "{low:?} {high:?}");
         assert!((high[0] - low[0] - 1.98).abs() < 0.2, "{low:?} {high:?}");
-        assert!(bounds(&look, &[]).is_none());
+        assert!(bounds(&look, 0.005, &[]).is_none());
     }
 
     #[test]

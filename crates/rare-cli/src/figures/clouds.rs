@@ -13,17 +13,36 @@ use crate::images::Image;
 const FINER: usize = 2;
 /// Radii of discs, fine pixels.
 const SMALLEST: f64 = 1.3;
-const LARGEST: f64 = 9.0;
-/// Discs are that much larger than half the distance of points on average, to close surfaces.
-const CLOSING: f64 = 0.8;
+const LARGEST: f64 = 4.0;
+/// The radius of a disc by the usual distance of points, so that surfaces are closed.
+const CLOSING: f64 = 0.9;
 /// The side of the cells in which the density of points is counted, fine pixels.
 const CELL: usize = 12;
 /// How far apart the pixels are that shade one another, fine pixels.
 const SHADING_REACH: isize = 3;
 /// Steps in depth beyond this many times their distance in the image shade no more.
 const STEEPEST: f64 = 4.0;
+/// The light of a pixel is the mean of those within so many fine pixels, since the depths of scans are noisy.
+const SMOOTHING: usize = 2;
+
 /// How dark the steepest step on all sides makes a pixel: the exponent.
-const DARKNESS: f64 = 1.5;
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Darkness(f64);
+
+impl Darkness {
+    /// Shows shape.
+    pub(super) const DEEP: Darkness = Darkness(1.5);
+    /// Leaves colours that mean something readable.
+    pub(super) const FAINT: Darkness = Darkness(0.45);
+}
+
+/// How dots look.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Style {
+    /// Fine pixels.
+    pub(super) radius: f64,
+    pub(super) darkness: Darkness,
+}
 
 /// A point to be drawn.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -85,15 +104,50 @@ pub(super) struct Frame {
     pub(super) height: usize,
 }
 
-/// The dots as the camera sees them on white.
-pub(super) fn render(dots: &[Dot], look: &Look, frame: &Frame) -> Image {
-    let mut buffer = Buffer::new(frame);
-    let seen: Vec<Seen> = dots.iter().filter_map(|dot| buffer.see(dot, look, frame)).collect();
-    let discs = offsets(buffer.radius(&seen));
-    for dot in &seen {
-        buffer.draw(dot, &discs);
+impl Frame {
+    /// Columns and rows of fine pixels.
+    fn fine(&self) -> [usize; 2] {
+        [self.width * FINER, self.height * FINER]
     }
-    buffer.shaded()
+
+    /// `None` outside of the image.
+    fn see(&self, dot: &Dot, look: &Look) -> Option<Seen> {
+        let [right, up, away] = look.seen(&dot.position);
+        let [width, height] = self.fine().map(|pixels| pixels as f64);
+        let scale = self.pixels_per_metre * FINER as f64;
+        let x = (right - self.centre[0]) * scale + width / 2.0;
+        let y = (self.centre[1] - up) * scale + height / 2.0;
+        let depth = away * scale;
+        let inside = (0.0..width).contains(&x) && (0.0..height).contains(&y) && depth.is_finite();
+        inside.then_some(Seen { x: x as isize, y: y as isize, depth, colour: dot.colour })
+    }
+}
+
+/// The dots as the camera sees them on white.
+pub(super) fn render(dots: &[Dot], look: &Look, frame: &Frame, style: Style) -> Image {
+    let mut buffer = Buffer::new(frame);
+    let disc = offsets(style.radius);
+    for seen in dots.iter().filter_map(|dot| frame.see(dot, look)) {
+        buffer.draw(&seen, &disc);
+    }
+    buffer.image(&buffer.light(style.darkness))
+}
+
+/// The radius of discs that close the surfaces of a cloud, fine pixels: from the usual distance of neighbouring dots
+/// where they are rather sparse, that in the cell of the lower quartile of densities.
+pub(super) fn closing_radius(dots: &[Dot], look: &Look, frame: &Frame) -> f64 {
+    let [columns, rows] = frame.fine().map(|pixels| pixels.div_ceil(CELL));
+    let mut counts = vec![0_usize; columns * rows];
+    for dot in dots.iter().filter_map(|dot| frame.see(dot, look)) {
+        let cell = dot.y as usize / CELL * columns + dot.x as usize / CELL;
+        if let Some(count) = counts.get_mut(cell) {
+            *count += 1;
+        }
+    }
+    counts.retain(|&count| count > 0);
+    counts.sort_unstable();
+    let usual = counts.get(counts.len() / 4).copied().unwrap_or(1);
+    (CLOSING * CELL as f64 / (usual as f64).sqrt()).clamp(SMALLEST, LARGEST)
 }
 
 /// A dot in the image, fine pixels.
@@ -115,41 +169,9 @@ struct Buffer {
 
 impl Buffer {
     fn new(frame: &Frame) -> Buffer {
-        let (width, height) = (frame.width * FINER, frame.height * FINER);
+        let [width, height] = frame.fine();
         let size = width * height;
         Buffer { width, height, depth: vec![f64::INFINITY; size], colours: vec![WHITE; size] }
-    }
-
-    /// `None` outside of the image.
-    fn see(&self, dot: &Dot, look: &Look, frame: &Frame) -> Option<Seen> {
-        let [right, up, away] = look.seen(&dot.position);
-        let scale = frame.pixels_per_metre * FINER as f64;
-        let x = (right - frame.centre[0]) * scale + self.width as f64 / 2.0;
-        let y = (frame.centre[1] - up) * scale + self.height as f64 / 2.0;
-        let inside =
-            (0.0..self.width as f64).contains(&x) && (0.0..self.height as f64).contains(&y);
-        let depth = away * scale;
-        (inside && depth.is_finite()).then_some(Seen {
-            x: x as isize,
-            y: y as isize,
-            depth,
-            colour: dot.colour,
-        })
-    }
-
-    /// Half the distance of neighbouring dots on average, within bounds.
-    fn radius(&self, seen: &[Seen]) -> f64 {
-        let columns = self.width.div_ceil(CELL);
-        let mut taken = vec![false; columns * self.height.div_ceil(CELL)];
-        for dot in seen {
-            let cell = dot.y as usize / CELL * columns + dot.x as usize / CELL;
-            if let Some(taken) = taken.get_mut(cell) {
-                *taken = true;
-            }
-        }
-        let cells = taken.into_iter().filter(|&taken| taken).count();
-        let spacing = CELL as f64 * (cells as f64 / seen.len().max(1) as f64).sqrt();
-        (CLOSING * spacing).clamp(SMALLEST, LARGEST)
     }
 
     fn draw(&mut self, dot: &Seen, disc: &[[isize; 2]]) {
@@ -168,8 +190,18 @@ impl Buffer {
         (x < self.width && y < self.height).then_some(y * self.width + x)
     }
 
-    /// How much of its light a pixel keeps, 0 to 1.
-    fn light(&self, x: usize, y: usize, depth: f64) -> f64 {
+    /// How much of its light every fine pixel keeps, 0 to 1.
+    fn light(&self, darkness: Darkness) -> Vec<f32> {
+        let light = |(pixel, &depth): (usize, &f64)| {
+            let (x, y) = (pixel % self.width, pixel / self.width);
+            if depth.is_finite() { self.light_at(x, y, depth, darkness) as f32 } else { 1.0 }
+        };
+        let sharp: Vec<f32> = self.depth.iter().enumerate().map(light).collect();
+        let across = self.smoothed(&sharp, 1);
+        self.smoothed(&across, self.width as isize)
+    }
+
+    fn light_at(&self, x: usize, y: usize, depth: f64, Darkness(darkness): Darkness) -> f64 {
         let sides = [[-1, 0], [1, 0], [0, -1], [0, 1], [-1, -1], [1, -1], [-1, 1], [1, 1]];
         let mut before = 0.0;
         for [right, down] in sides.map(|side: [isize; 2]| side.map(|step| step * SHADING_REACH)) {
@@ -178,26 +210,42 @@ impl Buffer {
             // Where nothing is, the difference is minus infinity: it casts no shade.
             before += steepness.clamp(0.0, STEEPEST) / STEEPEST;
         }
-        (-DARKNESS * before / sides.len() as f64 * 2.0).exp()
+        // Half of the sides are the most that a plain step has before it.
+        (-darkness * before / (sides.len() / 2) as f64).exp()
     }
 
-    /// The image of fine pixels, shaded, at its own size.
-    fn shaded(&self) -> Image {
+    /// The means over neighbours that are `stride` apart, where something is.
+    fn smoothed(&self, light: &[f32], stride: isize) -> Vec<f32> {
+        let reach = SMOOTHING as isize;
+        let mean = |(pixel, depth): (usize, &f64)| {
+            if depth.is_infinite() {
+                return 1.0;
+            }
+            let near = (-reach..=reach).filter_map(|step| {
+                let pixel = pixel.checked_add_signed(step * stride)?;
+                self.depth.get(pixel)?.is_finite().then_some(*light.get(pixel)?)
+            });
+            let (sum, count) =
+                near.fold((0.0, 0.0), |(sum, count), light| (sum + light, count + 1.0));
+            sum / f32::max(count, 1.0)
+        };
+        self.depth.iter().enumerate().map(mean).collect()
+    }
+
+    /// The image of fine pixels under some light, at its own size.
+    fn image(&self, light: &[f32]) -> Image {
         let (width, height) = (self.width / FINER, self.height / FINER);
         let pixels = (0..width * height).map(|pixel| {
             let (x, y) = (pixel % width * FINER, pixel / width * FINER);
             let mut sum = [0.0; 3];
             for (right, down) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
                 let fine = (y + down) * self.width + x + right;
-                let depth = self.depth[fine];
-                let light =
-                    if depth.is_finite() { self.light(x + right, y + down, depth) } else { 1.0 };
-                let colour = self.colours[fine];
+                let (light, colour) = (light[fine], self.colours[fine]);
                 sum = std::array::from_fn(|channel| {
-                    sum[channel] + light * f64::from(colour[channel])
+                    sum[channel] + light * f32::from(colour[channel])
                 });
             }
-            sum.map(|channel| (channel / (FINER * FINER) as f64).round() as u8)
+            sum.map(|channel| (channel / (FINER * FINER) as f32).round() as u8)
         });
         Image { width, height, pixels: pixels.collect() }
     }
@@ -219,13 +267,15 @@ mod tests {
     const BLUE: [u8; 3] = [0, 0, 200];
     const FRAME: Frame = Frame { centre: [0.0; 2], pixels_per_metre: 20.0, width: 60, height: 40 };
 
+    const STYLE: Style = Style { radius: 3.0, darkness: Darkness::DEEP };
+
     fn dots(points: &[[f64; 3]], colour: [u8; 3]) -> Vec<Dot> {
         points.iter().map(|&position| Dot { position: position.into(), colour }).collect()
     }
 
     /// The colour of the middle.
     fn middle(dots: &[Dot], look: &Look) -> [u8; 3] {
-        render(dots, look, &FRAME).pixels[20 * 60 + 30]
+        render(dots, look, &FRAME, STYLE).pixels[20 * 60 + 30]
     }
 
     #[test]
@@ -259,7 +309,8 @@ mod tests {
     #[test]
     fn places_are_to_scale() {
         // 20 pixels per metre: half a metre to the left (y of a scanner) is 10 pixels to the left.
-        let image = render(&dots(&[[0.0, 0.5, 0.0]], RED), &Look::above(SceneKind::Lidar), &FRAME);
+        let image =
+            render(&dots(&[[0.0, 0.5, 0.0]], RED), &Look::above(SceneKind::Lidar), &FRAME, STYLE);
         let inked = (0..image.pixels.len()).filter(|&pixel| image.pixels[pixel] != WHITE);
         let columns: Vec<usize> = inked.map(|pixel| pixel % 60).collect();
         let mean = columns.iter().sum::<usize>() as f64 / columns.len() as f64;
@@ -274,11 +325,13 @@ mod tests {
         };
         let floor = dots(&grid(0.0, -12, 12), RED);
         let above = Look::above(SceneKind::Lidar);
-        let image = render(&floor, &above, &FRAME);
+        let radius = closing_radius(&floor, &above, &FRAME);
+        assert!(radius < LARGEST);
+        let image = render(&floor, &above, &FRAME, Style { radius, ..STYLE });
         let shown = (10..30).flat_map(|y| (10..50).map(move |x| y * 60 + x));
         assert!(shown.clone().all(|pixel| image.pixels[pixel] == RED), "flat and closed");
         let with_step = [floor, dots(&grid(1.0, 0, 12), RED)].concat();
-        let image = render(&with_step, &above, &FRAME);
+        let image = render(&with_step, &above, &FRAME, STYLE);
         assert!(shown.clone().any(|pixel| image.pixels[pixel][0] < 150), "the step is dark");
     }
 
@@ -286,12 +339,13 @@ mod tests {
     fn hostile_dots_are_left_out() {
         let odd = [[1e300, -1e300, 1e300], [f64::MAX; 3], [0.0, 0.0, 1e308], [0.0, 0.0, f64::MAX]];
         let look = Look::oblique(SceneKind::Object);
-        render(&dots(&odd, RED), &look, &FRAME);
-        assert!(render(&[], &look, &FRAME).pixels.iter().all(|&pixel| pixel == WHITE));
+        render(&dots(&odd, RED), &look, &FRAME, STYLE);
+        assert_eq!(closing_radius(&[], &look, &FRAME), LARGEST);
+        assert!(render(&[], &look, &FRAME, STYLE).pixels.iter().all(|&pixel| pixel == WHITE));
         for pixels_per_metre in [0.0, f64::INFINITY, f64::NAN, 1e-300] {
-            render(&dots(&odd, RED), &look, &Frame { pixels_per_metre, ..FRAME });
+            render(&dots(&odd, RED), &look, &Frame { pixels_per_metre, ..FRAME }, STYLE);
         }
         let nothing = Frame { width: 0, height: 0, ..FRAME };
-        assert!(render(&dots(&odd, RED), &look, &nothing).pixels.is_empty());
+        assert!(render(&dots(&odd, RED), &look, &nothing, STYLE).pixels.is_empty());
     }
 }

@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 
-use crate::figures::canvas::{Area, BLACK, Canvas, Pen, WHITE, from_points};
+use crate::figures::canvas::{Area, BLACK, Canvas, Pen, from_points};
 use crate::figures::scales;
 use crate::figures::text::{self, Anchor, Text};
 use crate::images::viridis;
@@ -14,15 +14,21 @@ pub(super) const MARGIN: f32 = 10.0;
 /// Between panels, pixels.
 const GAP: f32 = 22.0;
 /// Of captions, points.
-const TEXT_POINTS: f32 = 9.0;
+const TEXT_POINTS: f32 = 8.5;
 /// Of ticks and what stands within panels, points.
-const SMALL_POINTS: f32 = 8.0;
+const SMALL_POINTS: f32 = 7.5;
 /// Text is made smaller rather than cut off, but not below this share of its size.
 const SMALLEST: f32 = 0.6;
 /// What a colour bar takes beside its row, pixels.
-pub(super) const COLOUR_BAR: f32 = 125.0;
+pub(super) const COLOUR_BAR: f32 = 185.0;
 /// What a line of captions or of a legend takes, pixels.
 pub(super) const LINE: f32 = 66.0;
+/// From one line of a caption to the next, by the size of the text.
+const LINE_PITCH: f32 = 1.25;
+/// What a name of a row takes beside it, pixels.
+pub(super) const ROW_NAME: f32 = 50.0;
+/// Pixels.
+const LONGEST_SCALE_BAR: f64 = 330.0;
 const RULE: [u8; 3] = [150; 3];
 
 pub(super) fn text_size() -> f32 {
@@ -38,6 +44,24 @@ pub(super) fn thin() -> Pen {
     Pen::new(from_points(0.4), RULE)
 }
 
+/// What is left free beside and below panels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Room {
+    /// Pixels.
+    pub(super) left: f32,
+    /// Pixels.
+    pub(super) right: f32,
+    /// Lines of every caption.
+    pub(super) lines: usize,
+}
+
+impl Room {
+    /// For captions of one line.
+    pub(super) const CAPTIONS: Room = Room { left: 0.0, right: 0.0, lines: 1 };
+    /// For a colour bar as well.
+    pub(super) const COLOUR_BAR: Room = Room { left: 0.0, right: COLOUR_BAR, lines: 1 };
+}
+
 /// Panels of one size, row by row, with a caption below each.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Grid {
@@ -45,16 +69,17 @@ pub(super) struct Grid {
     count: usize,
     /// Width and height, pixels.
     panel: [f32; 2],
+    room: Room,
 }
 
 impl Grid {
-    /// `aspect` is the height of a panel by its width; `right` is left free beside the panels.
-    pub(super) fn new(count: usize, columns: usize, aspect: f32, right: f32) -> Grid {
+    /// `aspect` is the height of a panel by its width.
+    pub(super) fn new(count: usize, columns: usize, aspect: f32, room: Room) -> Grid {
         let columns = columns.max(1);
-        let free = WIDTH as f32 - 2.0 * MARGIN - right - GAP * (columns - 1) as f32;
-        let width = (free / columns as f32).floor().max(1.0);
+        let taken = 2.0 * MARGIN + room.left + room.right + GAP * (columns - 1) as f32;
+        let width = ((WIDTH as f32 - taken) / columns as f32).floor().max(1.0);
         let height = (width * within_bounds(aspect)).round().max(1.0);
-        Grid { columns, count, panel: [width, height] }
+        Grid { columns, count, panel: [width, height], room }
     }
 
     pub(super) fn columns(&self) -> usize {
@@ -65,8 +90,8 @@ impl Grid {
         let [width, height] = self.panel;
         let (column, row) = (index % self.columns, index / self.columns);
         Area {
-            x: MARGIN + column as f32 * (width + GAP),
-            y: MARGIN + row as f32 * (height + LINE),
+            x: MARGIN + self.room.left + column as f32 * (width + GAP),
+            y: MARGIN + row as f32 * self.pitch(),
             width,
             height,
         }
@@ -75,7 +100,21 @@ impl Grid {
     /// Where the last row of captions ends.
     pub(super) fn bottom(&self) -> f32 {
         let rows = self.count.div_ceil(self.columns);
-        MARGIN + rows as f32 * (self.panel[1] + LINE)
+        MARGIN + rows as f32 * self.pitch()
+    }
+
+    /// From one row to the next.
+    fn pitch(&self) -> f32 {
+        let more = self.room.lines.saturating_sub(1) as f32;
+        self.panel[1] + LINE + more * LINE_PITCH * text_size()
+    }
+
+    /// Writes what a row is about to the left of its first panel.
+    pub(super) fn row_name(&self, canvas: &mut Canvas, row: usize, content: &str) {
+        let first = self.area(row * self.columns);
+        let place = [first.x - 0.45 * text_size(), first.y + first.height / 2.0];
+        let (anchor, size) = (Anchor::Middle, text_size());
+        canvas.text(&Text { content, place, anchor, size, colour: BLACK, upward: true });
     }
 
     /// A sheet with room for the panels and `below` more pixels.
@@ -94,8 +133,11 @@ impl Grid {
 /// Writes "(a) ..." below an area.
 pub(super) fn caption(canvas: &mut Canvas, area: Area, index: usize, words: &str) {
     let content = format!("({}) {words}", letter(index));
-    let place = [area.x + area.width / 2.0, area.bottom() + 1.2 * text_size()];
-    fitted(canvas, &content, place, area.width + 0.8 * GAP);
+    for (line, content) in content.lines().enumerate() {
+        let below = (1.2 + LINE_PITCH * line as f32) * text_size();
+        let place = [area.x + area.width / 2.0, area.bottom() + below];
+        fitted(canvas, content, place, area.width + 0.8 * GAP);
+    }
 }
 
 /// Text around the middle of its line, made smaller where it is wider than `most`.
@@ -144,7 +186,7 @@ pub(super) struct ColourBar<'a> {
     pub(super) unit: &'a str,
     /// Whether the lower end is bright.
     pub(super) falling: bool,
-    /// Whether there may be more than the upper end says.
+    /// Whether there may be more than the upper end says: it is then marked as such.
     pub(super) open: bool,
 }
 
@@ -161,43 +203,42 @@ impl ColourBar<'_> {
         }
         canvas.frame(bar, thin());
         let [low, high] = self.range;
-        let marks = scales::ticks(low, high, if bar.height > 250.0 { 3.0 } else { 1.5 });
+        let mut marks = scales::ticks(low, high, if bar.height > 250.0 { 3.0 } else { 1.5 });
+        if self.open {
+            let room = 1.2 * f64::from(small_size() / bar.height) * (high - low);
+            marks.retain(|(value, _)| *value < high - room);
+            marks.push((high, format!("≥{high:.2}")));
+        }
         let last = marks.len().saturating_sub(1);
         for (index, (value, words)) in marks.into_iter().enumerate() {
             let y = bar.bottom() - bar.height * ((value - low) / (high - low)) as f32;
-            let at_end = self.open && index == last && value >= high * 0.999_999;
-            let sign = if at_end { "≥" } else { "" };
             let unit = if index == last { format!(" {}", self.unit) } else { String::new() };
             canvas.line([bar.right(), y], [bar.right() + 8.0, y], Pen { colour: BLACK, ..thin() });
             // The letters stay within the height of the panel.
             let baseline =
                 (y + 0.35 * small_size()).clamp(bar.y + 0.7 * small_size(), bar.bottom());
             let place = [bar.right() + 14.0, baseline];
-            small(canvas, &format!("{sign}{words}{unit}"), place, Anchor::Start);
+            small(canvas, &format!("{words}{unit}"), place, Anchor::Start);
         }
     }
 }
 
-/// Draws how long a round length is, in the lower left corner of a panel.
-pub(super) fn scale_bar(canvas: &mut Canvas, panel: Area, pixels_per_metre: f64) {
-    let longest = 0.45 * f64::from(panel.width) / pixels_per_metre;
-    let Some(metres) = scales::round_step(longest, 1.0) else { return };
-    let long = (metres * pixels_per_metre) as f32;
-    let words = scales::round_length(metres);
-    let (pad, size) = (10.0, small_size());
-    let wide = long.max(text::width(&words, size));
-    let high = 1.2 * size + 12.0;
-    let ground = Area {
-        x: panel.x + pad,
-        y: panel.bottom() - high - 2.0 * pad,
-        width: wide + 2.0 * pad,
-        height: high + pad,
+/// Draws how long a round length is, at the left of the line of a legend; `y` is the top of the line.
+pub(super) fn scale_bar(canvas: &mut Canvas, y: f32, pixels_per_metre: f64) {
+    let Some(metres) = scales::round_step(LONGEST_SCALE_BAR / pixels_per_metre, 1.0) else {
+        return;
     };
-    canvas.rectangle(ground, WHITE, 0.8);
-    let (middle, y) = (ground.x + ground.width / 2.0, ground.bottom() - pad);
-    let pen = Pen::new(from_points(1.0), BLACK);
-    canvas.line([middle - long / 2.0, y], [middle + long / 2.0, y], pen);
-    small(canvas, &words, [middle, y - 12.0], Anchor::Middle);
+    let end = MARGIN + (metres * pixels_per_metre) as f32;
+    let (size, half) = (text_size(), 8.0);
+    let middle = y + 0.68 * size;
+    let pen = Pen::new(from_points(0.8), BLACK);
+    canvas.line([MARGIN, middle], [end, middle], pen);
+    for x in [MARGIN, end] {
+        canvas.line([x, middle - half], [x, middle + half], pen);
+    }
+    let content = &scales::round_length(metres);
+    let (place, anchor) = ([end + 0.4 * size, y + size], Anchor::Start);
+    canvas.text(&Text { content, place, anchor, size, colour: BLACK, upward: false });
 }
 
 /// A sheet with nothing but words: a figure that was asked for says why it is empty.
@@ -219,16 +260,18 @@ fn within_bounds(aspect: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::figures::canvas::WHITE;
 
     #[test]
     fn panels_fill_the_width_and_do_not_overlap() {
-        for (columns, right) in [(1, 0.0), (2, COLOUR_BAR), (3, 0.0), (4, COLOUR_BAR)] {
-            let grid = Grid::new(2 * columns, columns, 0.75, right);
+        let rooms = [Room::CAPTIONS, Room::COLOUR_BAR, Room { left: 50.0, right: 9.0, lines: 2 }];
+        for (columns, room) in (1..5).flat_map(|columns| rooms.map(|room| (columns, room))) {
+            let grid = Grid::new(2 * columns, columns, 0.75, room);
             let last = grid.area(columns - 1);
-            let end = WIDTH as f32 - MARGIN - right;
+            let end = WIDTH as f32 - MARGIN - room.right;
             assert!(last.right() <= end && last.right() > end - columns as f32);
             let below = grid.area(columns);
-            assert!(below.y > last.bottom() + 1.2 * text_size() && below.x == MARGIN);
+            assert!(below.y > last.bottom() + 1.3 * room.lines as f32 * text_size());
             assert!(columns == 1 || grid.area(0).right() < grid.area(1).x);
             assert!(grid.bottom() >= grid.area(2 * columns - 1).bottom() + LINE);
         }
@@ -252,10 +295,10 @@ mod tests {
     #[test]
     fn odd_aspects_and_scales_are_drawn() {
         for aspect in [0.0, -1.0, f32::NAN, f32::INFINITY, 1e9] {
-            let grid = Grid::new(1, 0, aspect, 0.0);
+            let grid = Grid::new(1, 0, aspect, Room::CAPTIONS);
             let mut canvas = grid.sheet(0.0).unwrap();
             for scale in [0.0, f64::NAN, f64::INFINITY, 1e-300, 1e300] {
-                scale_bar(&mut canvas, grid.area(0), scale);
+                scale_bar(&mut canvas, 0.0, scale);
             }
             for range in [[0.0, 0.0], [f64::NAN, 1.0], [1.0, f64::INFINITY]] {
                 let bar = ColourBar { range, unit: "m", falling: true, open: true };

@@ -6,7 +6,7 @@ use rare::verify::{Visibility, VisibilityMask};
 
 use crate::figures::Subject;
 use crate::figures::canvas::Canvas;
-use crate::figures::layout::{self, COLOUR_BAR, ColourBar, Grid, LINE};
+use crate::figures::layout::{self, COLOUR_BAR, ColourBar, Grid, LINE, ROW_NAME, Room};
 use crate::images::{self, AGREE, Image, OCCLUDED, VIOLATION};
 
 /// Panels of maps that are wider than that many times their height stand two in a row, others four.
@@ -22,14 +22,16 @@ struct Panel {
 pub(super) fn draw_depths(subject: &Subject<'_>) -> Result<Canvas> {
     let views = subject.views();
     let ranges: Vec<_> = views.iter().map(|(_, view)| depth_range(view)).collect();
-    let panels: Vec<Panel> = views.iter().flat_map(|(name, view)| depths(name, view)).collect();
-    let Some(grid) = grid(&panels, COLOUR_BAR) else { return no_views() };
+    let panels: Vec<Panel> = views.iter().flat_map(|(_, view)| depths(view)).collect();
+    let room = Room { left: ROW_NAME, right: COLOUR_BAR, lines: 1 };
+    let Some(grid) = grid(&panels, room) else { return no_views() };
     let mut canvas = grid.sheet(0.0)?;
     draw_panels(&mut canvas, &grid, &panels);
     let rows_of_view = if grid.columns() == 4 { 1 } else { 2 };
-    for (view, range) in ranges.iter().enumerate() {
-        let Some(range) = range.map(|range| range.map(f64::from)) else { continue };
+    for (view, ((name, _), range)) in views.iter().zip(ranges).enumerate() {
         for row in view * rows_of_view..(view + 1) * rows_of_view {
+            grid.row_name(&mut canvas, row, name);
+            let Some(range) = range.map(|range| range.map(f64::from)) else { continue };
             let last = grid.area((row + 1) * grid.columns() - 1);
             let bar = ColourBar { range, unit: "m", falling: true, open: false };
             bar.draw(&mut canvas, last);
@@ -47,7 +49,7 @@ pub(super) fn draw_features(subject: &Subject<'_>) -> Result<Canvas> {
         images.into_iter().zip(captions).map(|(image, caption)| Panel { image, caption })
     });
     let panels: Vec<Panel> = panels.collect();
-    let Some(grid) = grid(&panels, 0.0) else { return no_views() };
+    let Some(grid) = grid(&panels, Room::CAPTIONS) else { return no_views() };
     let mut canvas = grid.sheet(0.0)?;
     draw_panels(&mut canvas, &grid, &panels);
     Ok(canvas)
@@ -61,11 +63,11 @@ pub(super) fn draw_masks(subject: &Subject<'_>) -> Result<Canvas> {
         let masks = poses.iter().filter_map(|pose| Some((pose.name, view.masks.get(pose.index)?)));
         masks.map(move |(pose, mask)| Panel {
             image: images::mask_image(mask),
-            caption: format!("{name}, {pose}: {}", agreement(mask)),
+            caption: format!("{name}, {pose}\n{}", agreement(mask)),
         })
     });
     let panels: Vec<Panel> = panels.collect();
-    let Some(grid) = grid(&panels, 0.0) else { return no_views() };
+    let Some(grid) = grid(&panels, Room { lines: 2, ..Room::CAPTIONS }) else { return no_views() };
     let mut canvas = grid.sheet(LINE)?;
     draw_panels(&mut canvas, &grid, &panels);
     let entries = [
@@ -78,17 +80,17 @@ pub(super) fn draw_masks(subject: &Subject<'_>) -> Result<Canvas> {
     Ok(canvas)
 }
 
-fn depths(name: &str, view: &IllustratedView) -> Vec<Panel> {
+fn depths(view: &IllustratedView) -> Vec<Panel> {
     let range = depth_range(view);
     let maps = [
-        ("reference", &view.reference.sparse),
+        ("reference, raw", &view.reference.sparse),
         ("reference, densified", &view.reference.dense),
-        ("source", &view.source.sparse),
+        ("source, raw", &view.source.sparse),
         ("source, densified", &view.source.dense),
     ];
-    let panel = |(what, map)| Panel {
+    let panel = |(what, map): (&str, &_)| Panel {
         image: images::depth_image(map, range),
-        caption: format!("{name}: {what}"),
+        caption: what.to_owned(),
     };
     maps.into_iter().map(panel).collect()
 }
@@ -98,11 +100,11 @@ fn depth_range(view: &IllustratedView) -> Option<[f32; 2]> {
 }
 
 /// Two or four panels in a row; `None` if there is none.
-fn grid(panels: &[Panel], right: f32) -> Option<Grid> {
+fn grid(panels: &[Panel], room: Room) -> Option<Grid> {
     let first = &panels.first()?.image;
     let (width, height) = (first.width as f32, first.height as f32);
     let columns = if width > WIDE * height { 2 } else { panels.len().min(4) };
-    Some(Grid::new(panels.len(), columns, height / width, right))
+    Some(Grid::new(panels.len(), columns, height / width, room))
 }
 
 fn draw_panels(canvas: &mut Canvas, grid: &Grid, panels: &[Panel]) {
@@ -112,7 +114,7 @@ fn draw_panels(canvas: &mut Canvas, grid: &Grid, panels: &[Panel]) {
     }
 }
 
-/// The share of what both clouds show in a mask that agrees.
+/// The shares of what is comparable in a mask that agree and do not.
 fn agreement(mask: &VisibilityMask) -> String {
     let count =
         |kinds: &[Visibility]| mask.pixels.iter().filter(|kind| kinds.contains(kind)).count();
@@ -120,7 +122,10 @@ fn agreement(mask: &VisibilityMask) -> String {
     let against = count(&[Visibility::Violation, Visibility::GrossViolation]);
     match agree + against {
         0 => "nothing in common".to_owned(),
-        all => format!("{:.0} % agree", 100.0 * agree as f64 / all as f64),
+        all => {
+            let share = |count: usize| 100.0 * count as f64 / all as f64;
+            format!("{:.1} % agree, {:.1} % violate", share(agree), share(against))
+        }
     }
 }
 

@@ -6,12 +6,12 @@ use rare::refine::{IllustratedView, PixelMatch};
 
 use crate::figures::Subject;
 use crate::figures::canvas::{Area, Canvas, Pen, from_points};
-use crate::figures::layout::{self, Grid, LINE};
+use crate::figures::layout::{self, Grid, LINE, Room};
 use crate::figures::maps;
 use crate::images;
 
 /// More lines than that hide one another.
-const MOST_LINES: usize = 400;
+const MOST_LINES: usize = 250;
 const INLIER: [u8; 3] = [0, 158, 115];
 const OUTLIER: [u8; 3] = [213, 94, 0];
 
@@ -20,7 +20,7 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
     let Some((_, first)) = views.first() else { return maps::no_views() };
     let map = &first.source.dense;
     let aspect = map.height() as f32 / map.width() as f32;
-    let grid = Grid::new(2 * views.len(), 2, aspect, 0.0);
+    let grid = Grid::new(2 * views.len(), 2, aspect, Room::CAPTIONS);
     let mut canvas = grid.sheet(LINE)?;
     for (index, (name, view)) in views.iter().enumerate() {
         let areas = [grid.area(2 * index), grid.area(2 * index + 1)];
@@ -30,7 +30,7 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
         let both = Area { width: right.right() - left.x, ..left };
         layout::caption(&mut canvas, both, index, &words);
     }
-    let entries = [(INLIER, "agrees with the result"), (OUTLIER, "does not")];
+    let entries = [(INLIER, "inlier of the result"), (OUTLIER, "outlier")];
     layout::legend(&mut canvas, grid.bottom(), &entries);
     Ok(canvas)
 }
@@ -47,7 +47,7 @@ fn draw_view(canvas: &mut Canvas, view: &IllustratedView, areas: [Area; 2]) {
     for (inlier, colour) in [(false, OUTLIER), (true, INLIER)] {
         for found in shown.iter().filter(|found| found.inlier == inlier) {
             let [source, reference] = ends(found, maps, areas);
-            let pen = Pen { opacity: 0.75, ..Pen::new(from_points(0.45), colour) };
+            let pen = Pen { opacity: 0.8, ..Pen::new(from_points(0.4), colour) };
             canvas.line(source, reference, pen);
             for end in [source, reference] {
                 canvas.rectangle(spot(end), colour, 1.0);
@@ -100,16 +100,16 @@ mod tests {
 
     fn found(index: usize) -> PixelMatch {
         let (source, reference) = ((index, 0), (0, 0));
-        PixelMatch { set: SetName::CommonReference, source, reference, inlier: index < 600 }
+        PixelMatch { set: SetName::CommonReference, source, reference, inlier: index < 1000 }
     }
 
     #[test]
     fn matches_are_chosen_evenly_and_what_is_left_out_is_said() {
-        let matches: Vec<PixelMatch> = (0..1200).map(found).collect();
+        let matches: Vec<PixelMatch> = (0..2000).map(found).collect();
         let shown = evenly(&matches);
         assert_eq!(shown.len(), MOST_LINES);
-        assert!(shown.windows(2).all(|pair| pair[1].source.0 - pair[0].source.0 == 3));
-        assert_eq!(counts(&matches), "600 inliers, 600 outliers; 400 of 1200 shown");
+        assert!(shown.windows(2).all(|pair| pair[1].source.0 - pair[0].source.0 == 8));
+        assert_eq!(counts(&matches), "1000 inliers, 1000 outliers; 250 of 2000 shown");
         assert_eq!(counts(&matches[..2]), "2 inliers, 0 outliers");
         assert_eq!(counts(&[]), "no matches");
     }

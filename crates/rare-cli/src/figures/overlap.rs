@@ -9,13 +9,13 @@ use rayon::prelude::*;
 
 use crate::figures::alignment;
 use crate::figures::canvas::Canvas;
-use crate::figures::clouds::{self, Dot, Frame, Look};
-use crate::figures::layout::{self, COLOUR_BAR, ColourBar, Grid, LINE};
+use crate::figures::clouds::{self, Darkness, Dot, Frame, Look, Style};
+use crate::figures::layout::{self, ColourBar, Grid, LINE, Room};
 use crate::figures::{Pose, Subject};
 use crate::images::{AGREE, OCCLUDED, VIOLATION, viridis};
 
 /// Where no sensor says anything.
-const UNSEEN: [u8; 3] = [205, 208, 215];
+const UNSEEN: [u8; 3] = [226, 228, 232];
 /// The colours of visibility.
 const MEANINGS: [([u8; 3], &str); 4] = [
     (AGREE, "agree"),
@@ -40,18 +40,20 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
     };
     let panels = [dots(subject, pose, seen), dots(subject, pose, residual)];
     let look = Look::oblique(subject.kind);
-    let Some((grid, frame)) = fit(&look, &panels[0]) else {
+    let Some((grid, frame)) = fit(subject, &look, &panels[0]) else {
         return layout::message("no point was judged");
     };
     let mut canvas = grid.sheet(LINE)?;
-    let images = panels.par_iter().map(|dots| clouds::render(dots, &look, &frame));
+    let radius = clouds::closing_radius(&panels[0], &look, &frame);
+    let style = Style { radius, darkness: Darkness::FAINT };
+    let images = panels.par_iter().map(|dots| clouds::render(dots, &look, &frame, style));
     let images: Vec<_> = images.collect();
     let captions = ["result, what the sensors say", "result, distance from the other cloud"];
     for (index, (image, caption)) in images.iter().zip(captions).enumerate() {
         canvas.image(image, grid.area(index));
         grid.caption(&mut canvas, index, caption);
     }
-    layout::scale_bar(&mut canvas, grid.area(0), frame.pixels_per_metre);
+    layout::scale_bar(&mut canvas, grid.bottom(), frame.pixels_per_metre);
     ColourBar { range: [0.0, end], unit: "m", falling: false, open: true }
         .draw(&mut canvas, grid.area(1));
     layout::legend(&mut canvas, grid.bottom(), &MEANINGS);
@@ -59,12 +61,16 @@ pub(super) fn draw(subject: &Subject<'_>) -> Result<Canvas> {
 }
 
 /// Two panels that show all dots; `None` if there are none.
-fn fit(look: &Look, dots: &[Dot]) -> Option<(Grid, Frame)> {
+fn fit(subject: &Subject<'_>, look: &Look, dots: &[Dot]) -> Option<(Grid, Frame)> {
     let points: Vec<Point3<f64>> = dots.iter().map(|dot| dot.position).collect();
-    let [low, high] = alignment::with_border(alignment::bounds(look, &points)?);
+    let [low, high] = alignment::with_border(alignment::bounds(
+        look,
+        alignment::outlying(subject.kind),
+        &points,
+    )?);
     let [right, up] = [0, 1].map(|axis| (high[axis] - low[axis]).max(1e-6));
     let aspect = (up / right).clamp(ASPECTS[0], ASPECTS[1]);
-    let grid = Grid::new(2, 2, aspect as f32, COLOUR_BAR);
+    let grid = Grid::new(2, 2, aspect as f32, Room::COLOUR_BAR);
     let panel = grid.area(0);
     let frame = Frame {
         centre: [0, 1].map(|axis| low[axis] / 2.0 + high[axis] / 2.0),
