@@ -31,6 +31,9 @@ use crate::run::Registration;
 const SOURCE: [u8; 3] = [230, 159, 0];
 const REFERENCE: [u8; 3] = [0, 114, 178];
 
+/// Draws one figure.
+type Draw = fn(&Subject<'_>) -> Result<Canvas>;
+
 /// What the figures are drawn of.
 struct Subject<'a> {
     source: &'a PointCloud,
@@ -89,7 +92,7 @@ fn poses(
 impl Subject<'_> {
     fn write(&self, folder: &Path) -> Result<Vec<PathBuf>> {
         fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
-        let figures: [(&str, fn(&Self) -> Result<Canvas>); 7] = [
+        let figures: [(&str, Draw); 7] = [
             ("alignment.png", alignment::draw),
             ("depth_maps.png", maps::draw_depths),
             ("features.png", maps::draw_features),
@@ -98,7 +101,7 @@ impl Subject<'_> {
             ("residuals.png", residuals::draw),
             ("overlap.png", overlap::draw),
         ];
-        let write = |(name, draw): &(&str, fn(&Self) -> Result<Canvas>)| {
+        let write = |(name, draw): &(&str, Draw)| {
             let path = folder.join(name);
             let png = draw(self)?.to_png()?;
             write_whole(&path, |writer| writer.write_all(&png))?;
@@ -120,7 +123,7 @@ impl Subject<'_> {
         frames.into_iter().filter_map(best).collect()
     }
 
-    /// Where the source is compared from, and the result; `None` for the first if there is only one transform.
+    /// Where the source is compared from, and the result; only the result if there is no other transform.
     fn before_and_after(&self) -> Vec<Pose> {
         let first = self.poses.len().saturating_sub(2);
         self.poses.iter().skip(first).copied().collect()

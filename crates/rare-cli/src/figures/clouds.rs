@@ -13,7 +13,7 @@ use crate::images::Image;
 const FINER: usize = 2;
 /// Radii of discs, fine pixels.
 const SMALLEST: f64 = 1.3;
-const LARGEST: f64 = 4.0;
+const LARGEST: f64 = 5.0;
 /// The radius of a disc by the usual distance of points, so that surfaces are closed.
 const CLOSING: f64 = 0.9;
 /// The side of the cells in which the density of points is counted, fine pixels.
@@ -177,7 +177,7 @@ impl Buffer {
     fn draw(&mut self, dot: &Seen, disc: &[[isize; 2]]) {
         for [right, down] in disc {
             let Some(pixel) = self.pixel(dot.x + right, dot.y + down) else { continue };
-            // Of equally near ones the first stays, whatever their order in memory became.
+            // Of equally near ones the first stays.
             if self.depth.get(pixel).is_some_and(|&nearest| dot.depth < nearest) {
                 self.depth[pixel] = dot.depth;
                 self.colours[pixel] = dot.colour;
@@ -320,17 +320,18 @@ mod tests {
     #[test]
     fn a_dense_surface_has_no_gaps_and_an_edge_casts_shade() {
         let grid = |z: f64, from: i32, to: i32| -> Vec<[f64; 3]> {
-            let row = |x: i32| (-12..=12).map(move |y| [f64::from(x) * 0.1, f64::from(y) * 0.1, z]);
+            let row =
+                |x: i32| (-24..=24).map(move |y| [f64::from(x) * 0.05, f64::from(y) * 0.05, z]);
             (from..=to).flat_map(row).collect()
         };
-        let floor = dots(&grid(0.0, -12, 12), RED);
+        let floor = dots(&grid(0.0, -24, 24), RED);
         let above = Look::above(SceneKind::Lidar);
         let radius = closing_radius(&floor, &above, &FRAME);
         assert!(radius < LARGEST);
         let image = render(&floor, &above, &FRAME, Style { radius, ..STYLE });
         let shown = (10..30).flat_map(|y| (10..50).map(move |x| y * 60 + x));
         assert!(shown.clone().all(|pixel| image.pixels[pixel] == RED), "flat and closed");
-        let with_step = [floor, dots(&grid(1.0, 0, 12), RED)].concat();
+        let with_step = [floor, dots(&grid(1.0, 0, 24), RED)].concat();
         let image = render(&with_step, &above, &FRAME, STYLE);
         assert!(shown.clone().any(|pixel| image.pixels[pixel][0] < 150), "the step is dark");
     }
