@@ -71,7 +71,7 @@ export class CameraPresets {
     this.points = points;
     const bounds = new Box3().setFromPoints(points);
     this.centre = bounds.getCenter(new Vector3());
-    this.radius = Math.max(bounds.getSize(new Vector3()).length() / 2, 1e-3);
+    this.radius = Math.max(bounds.getSize(new Vector3()).length() / 2, 1e-6);
   }
 
   /** The direction in which the reference's sensor looks, made level. */
@@ -131,7 +131,7 @@ function distanceFor(points, target, { away, right, above, high, wide }) {
     const offset = point.clone().sub(target);
     const side = Math.max(Math.abs(offset.dot(right)) / wide, Math.abs(offset.dot(above)) / high);
     return Math.max(most, side + offset.dot(away));
-  }, 1e-3);
+  }, 1e-6);
 }
 
 function middleInPicture(points, target, lens) {

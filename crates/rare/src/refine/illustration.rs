@@ -138,7 +138,7 @@ impl Refiner {
             views::transfer_all(pair, &viewpoints, pose, &maps, &features, self.sampling())
         });
         let fused = clock.time("fuse", || views::fuse_all(pair, &lifted));
-        let (sparse, dense) = (in_pairs(sparse, pair.unit)?, in_pairs(maps, pair.unit)?);
+        let (sparse, dense) = (in_pairs(&sparse, pair.unit)?, in_pairs(&maps, pair.unit)?);
         let maps = sparse.into_iter().zip(dense).zip(features);
         let points = lifted.into_iter().zip(fused);
         let seen = viewpoints.into_iter().zip(maps).zip(points);
@@ -253,22 +253,22 @@ impl Judge<'_> {
         }
     }
 
-    /// Distances from a surface, metres: within a voxel from the plane of its nearest point, else from the point itself.
+    /// Distances from a surface, metres. It consists of discs around its points, as wide as a voxel: between points no one
+    /// knows better, and beyond its edge the distance grows from 0.
     fn residuals(
         &self,
         points: &[Point3<f64>],
         surface: &IcpTarget,
         surface_from_points: &RigidTransform,
     ) -> Vec<f32> {
-        let voxel = self.pair.scale.voxel;
         let distance = |point: &Point3<f64>| {
             let point = surface_from_points.apply(point);
             let nearest = surface.tree().nearest(&point)?;
-            let distance = nearest.squared_distance.sqrt();
-            let plane =
-                surface.points().get(nearest.index).zip(surface.normals().get(nearest.index));
-            let across = plane.filter(|(_, normal)| distance < voxel && normal.norm() > 0.5);
-            Some(across.map_or(distance, |(on, normal)| (point - on).dot(normal).abs()))
+            let on = surface.points().get(nearest.index)?;
+            let normal = surface.normals().get(nearest.index)?;
+            let across = (point - on).dot(normal);
+            let along = (nearest.squared_distance - across * across).max(0.0).sqrt();
+            Some(across.hypot((along - self.pair.scale.voxel).max(0.0)))
         };
         let metres = |point| distance(point).map_or(f32::INFINITY, |d| (d * self.pair.unit) as f32);
         points.par_iter().map(metres).collect()
@@ -276,7 +276,7 @@ impl Judge<'_> {
 }
 
 /// The maps of each view, the reference's and the source's, with lengths in metres.
-fn in_pairs(maps: Vec<DepthMap>, unit: f64) -> Result<Vec<Both<DepthMap>>> {
+fn in_pairs(maps: &[DepthMap], unit: f64) -> Result<Vec<Both<DepthMap>>> {
     let in_metres = |map: &DepthMap| {
         let metres = |&depth: &f32| (f64::from(depth) * unit) as f32;
         DepthMap::new(*map.intrinsics(), map.depth().iter().map(metres).collect())
