@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes the README's pictures from `rare demo`: its report as a browser shows it, and one of its figures.
+# Makes the README's pictures from `rare demo`: its report as a browser shows it, from the top and one of its views.
 #
 #   cargo build --release && docs/make_pictures.sh
 #
@@ -11,8 +11,8 @@ tests=$root/crates/rare-cli/tests/browser
 scratch=$(mktemp -d)
 trap 'rm -rf "$scratch"' EXIT
 cd "$scratch"
-"$root/target/release/rare" demo --report demo.html --figures figures
+"$root/target/release/rare" demo --report demo.html
 [ -d "$tests/node_modules" ] || (cd "$tests" && npm ci --no-audit --no-fund)
 node "$tests/reports.mjs" --screenshots screenshots demo.html
 cp screenshots/demo-top.png "$root/docs/report.png"
-cp figures/matches.png "$root/docs/matches.png"
+cp screenshots/demo-view.png "$root/docs/view.png"

@@ -303,6 +303,8 @@ async function takeScreenshots(browser, page, file, options) {
   await page.screenshot({ path: at("full"), fullPage: true });
   const viewer = page.locator("#viewer .picture");
   if (await viewer.count() > 0) await viewer.screenshot({ path: at("viewer") });
+  const view = page.locator("article.view").first();
+  if (await view.count() > 0) await view.screenshot({ path: at("view") });
   await chooseTheme(page, "dark");
   await page.screenshot({ path: at("dark"), fullPage: true });
   await chooseTheme(page, "light");
