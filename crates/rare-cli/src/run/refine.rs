@@ -61,6 +61,7 @@ pub(super) fn registration(
     };
     let mut refinement = problem.solve(&refiner).with_context(|| which(clouds))?;
     refinement.warnings.extend(network.iter().flat_map(NetworkEncoder::warnings));
+    let network = network.as_ref().map(NetworkEncoder::record);
     let total_seconds = clock.elapsed().as_secs_f64();
     let scans = [&problem.source, &problem.reference];
     let initial = Some(&problem.initial);
@@ -73,7 +74,7 @@ pub(super) fn registration(
         initial: Some(problem.initial),
         refinement,
         illustration,
-        network: network.as_ref().map(NetworkEncoder::record),
+        network,
         read_seconds,
         total_seconds,
     })

@@ -44,6 +44,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
         reference: clouds.reference.display().to_string(),
         start: Start::Estimated { init_method: settings.init_method },
     };
+    let network = network.as_ref().map(NetworkEncoder::record);
     let total_seconds = clock.elapsed().as_secs_f64();
     let illustration = illustration(&refiner, [&source, &reference], None, &refinement, &settings)?;
     Ok(Registration {
@@ -54,7 +55,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
         initial: None,
         refinement,
         illustration,
-        network: network.as_ref().map(NetworkEncoder::record),
+        network,
         read_seconds,
         total_seconds,
     })
