@@ -22,6 +22,9 @@ use crate::refine::working_pair::WorkingPair;
 use crate::verify::{Verifier, Visibility, VisibilityMask};
 use crate::viewpoints::{Frame, Viewpoint};
 
+/// Surfaces are sought within so many voxels: whatever is farther off is not compared.
+const RESIDUAL_REACH: f64 = 5.0;
+
 /// What is to be shown of a pair.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IllustrationRequest {
@@ -90,7 +93,7 @@ pub struct PixelMatch {
 pub struct IllustratedCloud {
     /// Which of the cloud's points these are.
     pub indices: Vec<usize>,
-    /// For every pose the distance of each to the surface of the other cloud, metres.
+    /// For every pose the distance of each to the surface of the other cloud, metres; infinite beyond five voxels.
     pub residuals: Vec<Vec<f32>>,
     /// For every pose what the other cloud's sensor says of each.
     pub visibility: Vec<Vec<Visibility>>,
@@ -254,16 +257,17 @@ impl Judge<'_> {
     }
 
     /// Distances from a surface, metres. It consists of discs around its points, as wide as a voxel: between points no one
-    /// knows better, and beyond its edge the distance grows from 0.
+    /// knows better, and beyond its edge the distance grows from 0. Infinite where nothing is within reach.
     fn residuals(
         &self,
         points: &[Point3<f64>],
         surface: &IcpTarget,
         surface_from_points: &RigidTransform,
     ) -> Vec<f32> {
+        let reach = RESIDUAL_REACH * self.pair.scale.voxel;
         let distance = |point: &Point3<f64>| {
             let point = surface_from_points.apply(point);
-            let nearest = surface.tree().nearest(&point)?;
+            let nearest = surface.tree().nearest_within(&point, reach)?;
             let on = surface.points().get(nearest.index)?;
             let normal = surface.normals().get(nearest.index)?;
             let across = (point - on).dot(normal);

@@ -47,13 +47,17 @@ fn the_truth_looks_better_than_the_start() {
 fn maps_features_and_matches_belong_together() {
     let shown = illustrated(room(), 100);
     assert_eq!(shown.views.len(), 2);
+    // Metres, not working units: the depth camera sees its own scan as deep as it is.
+    let deepest = |depths: &[f32]| depths.iter().copied().fold(0.0, f32::max);
+    let points = room().target.cloud.points().iter();
+    let depth = points.map(|point| point.z).fold(0.0, f64::max) as f32;
+    let seen = deepest(shown.views[0].reference.sparse.depth());
+    assert!((seen / depth - 1.0).abs() < 0.02, "{seen} {depth}");
     for view in &shown.views {
         for map in [&view.reference, &view.source] {
             let seen = |depth: &[f32]| depth.iter().filter(|&&depth| depth > 0.0).count();
             assert!(seen(map.dense.depth()) > seen(map.sparse.depth()));
             assert!(seen(map.sparse.depth()) > 1000);
-            // Metres, not working units: the room is a few metres deep.
-            assert!(map.sparse.depth().iter().all(|&depth| depth < 12.0));
             assert_eq!(map.features.channels(), 3);
         }
         assert_eq!(view.masks.len(), 2);
