@@ -7,7 +7,9 @@ use crate::shared::{Workplace, argument};
 /// The data of a page.
 fn data(page: &str) -> Value {
     let (_, after) = page.split_once("id=\"data\">").unwrap();
-    serde_json::from_str(after.split_once("</script>").unwrap().0).unwrap()
+    let text = after.split_once("</script>").unwrap().0;
+    assert!(!text.contains(['<', '>', '&']), "what is in a name may end the script");
+    serde_json::from_str(text).unwrap()
 }
 
 /// The base64 text of a blob.
