@@ -330,7 +330,7 @@ fn scene(
 }
 
 /// Where up is in the reference's frame: a depth camera's y points down, everything else has z up.
-pub(crate) fn up(kind: SceneKind) -> [f64; 3] {
+fn up(kind: SceneKind) -> [f64; 3] {
     match kind {
         SceneKind::Indoor => [0.0, -1.0, 0.0],
         SceneKind::Lidar | SceneKind::Object => [0.0, 0.0, 1.0],

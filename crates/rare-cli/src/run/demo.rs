@@ -9,6 +9,7 @@ use rare::{RigidTransform, io as files};
 
 use crate::args::{Clouds, DemoArgs, Direction, Start};
 use crate::options::Options;
+use crate::outputs::{self, Output};
 use crate::run::{Registration, aligned, refine};
 use crate::summary;
 
@@ -19,6 +20,7 @@ const BLUE: [u8; 3] = [40, 110, 200];
 
 pub(super) fn run(args: &DemoArgs) -> Result<u8> {
     let folder = &args.output_dir;
+    check_shown(args)?;
     fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
     let pair = demo_pair(args.seed)?;
     let (clouds, start) = write_inputs(folder, &pair)?;
@@ -39,6 +41,13 @@ pub(super) fn run(args: &DemoArgs) -> Result<u8> {
         summary::say(&what_was_written(folder));
     }
     Ok(code)
+}
+
+/// Refuses places for the page and the figures before anything is made.
+fn check_shown(args: &DemoArgs) -> Result<()> {
+    let report = args.report.iter().map(|path| Output { option: "--report", path });
+    outputs::check(&[], &report.collect::<Vec<_>>())?;
+    args.figures.iter().try_for_each(|folder| outputs::check_folder("--figures", folder))
 }
 
 /// Writes what `rare refine` needs, so that anybody can repeat the demo by hand.

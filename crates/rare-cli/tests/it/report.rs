@@ -138,6 +138,13 @@ fn a_page_is_an_output_like_others() {
     workplace.refine(&["--report", argument(&source)]).assert_refused(&["--report", "input"]);
     let same = workplace.refine(&["--report", "out", "--json", "out"]);
     same.assert_refused(&["--report", "--json", "same file"]);
+    workplace.write("file", "kept");
+    workplace.refine(&["--figures", "file"]).assert_refused(&["--figures", "file"]);
+    for (option, place) in [("--report", "nowhere/out.html"), ("--figures", "file")] {
+        let before = workplace.names();
+        workplace.run(&["demo", "--quiet", option, place]).assert_refused(&[option, place]);
+        assert_eq!(workplace.names(), before);
+    }
     workplace.write("rare.toml", "report = \"from_file.html\"\n");
     assert_eq!(workplace.refine(&["--config", "rare.toml", "--quiet"]).code, 0);
     assert!(workplace.path("from_file.html").is_file());
