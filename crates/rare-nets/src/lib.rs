@@ -4,6 +4,8 @@
 //! |---|---|
 //! | [`engine`] | tensors, operations of fused size, kernels for each processor |
 //! | [`checkpoint`] | weight files, read without executing anything |
+//! | [`backbones`] | networks that describe and match two clouds |
+//! | [`outliers`] | networks that tell right correspondences from wrong ones |
 //! | [`cache`] | features that were computed before |
 //! | [`diffusion`] | Stable Diffusion 1.5 with a depth `ControlNet`: features of depth maps |
 //! | [`official`] | fragments and lists of pairs of the official repositories |
@@ -12,12 +14,18 @@
 //! The networks are written once, generic over [`engine::Backend`]; the geometry that uses their features is in the
 //! crate `rare`.
 
+pub mod backbones;
 pub mod cache;
 pub mod checkpoint;
 pub mod diffusion;
 pub mod engine;
+#[allow(dead_code)]
+mod layers;
+mod matrix;
 pub mod official;
+pub mod outliers;
 mod parameter;
 pub mod weights;
 
+pub use matrix::Matrix;
 pub use parameter::{Parameter, Values};

@@ -5,6 +5,7 @@
 //! [`Parameters`] puts the tensors of one network together, under one naming, wherever they come from.
 
 mod element;
+mod layout;
 mod parameters;
 mod pickle;
 mod safetensors;
@@ -13,6 +14,8 @@ mod tensor;
 mod weight_file;
 
 pub use element::ElementType;
+pub(crate) use layout::require;
+pub use layout::{Differences, Layout, Misshapen, compare};
 pub use parameters::Parameters;
 pub use pickle::{Instance, Object, open_pickle};
 pub use tensor::Tensor;

@@ -4,23 +4,26 @@
 //! only place where shapes are derived from a configuration: loading asks it for the shape of every tensor, and whether
 //! an optional part (the transformer of a block, the shortcut of a residual block) exists.
 
-mod differences;
-
-use std::collections::BTreeMap;
+use rare::Result;
 
 use super::{ControlNetConfig, TextConfig, UnetConfig};
-
-pub(crate) use differences::require;
-pub use differences::{Differences, Misshapen, compare};
-
-/// The shape of every tensor of a network, by name.
-pub type Layout = BTreeMap<String, Vec<usize>>;
+use crate::checkpoint::{self, Layout, Parameters};
 
 /// Residual blocks of each level of the encoder half; the decoder half has one more.
 pub(crate) const BLOCKS_PER_LEVEL: usize = 2;
 
 /// The width of the time embedding and of the gated feed-forward layers, as a multiple of the channels.
 const EXPANSION: usize = 4;
+
+/// Makes sure that weight files hold the tensors of `layout` and no others. `network` is its name for the message.
+///
+/// # Errors
+/// `InvalidInput` with the file and the first differences.
+pub(crate) fn require(layout: &Layout, parameters: &Parameters, network: &str) -> Result<()> {
+    let network = format!("the {network} that its configuration describes");
+    let advice = "take weights and configuration of Stable Diffusion 1.5 from one source";
+    checkpoint::require(layout, parameters, &network, advice)
+}
 
 /// Every tensor of the U-Net (Ronneberger et al., 2015; Rombach et al., 2022).
 #[must_use]

@@ -25,9 +25,7 @@ pub use cost::{
 pub use encoder::DiffusionEncoder;
 pub use layers::{Contexts, Timestep};
 pub(crate) use layout::require;
-pub use layout::{
-    Differences, Layout, Misshapen, compare, controlnet_layout, text_encoder_layout, unet_layout,
-};
+pub use layout::{controlnet_layout, text_encoder_layout, unet_layout};
 pub use noise::Noise;
 pub use pipeline::{Pipeline, TokenizerFiles};
 pub use sampler::{Hints, Networks, Plan, Prediction, Sampler};

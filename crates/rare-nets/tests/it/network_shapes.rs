@@ -10,9 +10,10 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use rare::Result;
 use rare_nets::Parameter;
 use rare_nets::checkpoint::Parameters;
+use rare_nets::checkpoint::{Differences, Layout, Misshapen, compare};
 use rare_nets::diffusion::{
-    Control, ControlNet, ControlNetConfig, Differences, Extent, LAYERS, Layout, Misshapen, Unet,
-    UnetConfig, compare, controlnet_layout, unet_layout,
+    Control, ControlNet, ControlNetConfig, Extent, LAYERS, Unet, UnetConfig, controlnet_layout,
+    unet_layout,
 };
 use rare_nets::engine::{Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
 use serde_json::{Value, json};

@@ -110,3 +110,48 @@ pub(crate) fn relative_difference(values: &[f32], golden: &[f64]) -> f64 {
     });
     difference / largest
 }
+
+/// A golden `.safetensors` file, read without the code that is tested.
+pub(crate) struct GoldenTensors {
+    header: serde_json::Value,
+    data: Vec<u8>,
+    path: PathBuf,
+}
+
+impl GoldenTensors {
+    /// Opens `golden/<relative>`; `None` where the shared data are missing.
+    pub(crate) fn open(relative: &str) -> Option<GoldenTensors> {
+        let path = path(&format!("golden/{relative}"))?;
+        let bytes = std::fs::read(&path).expect("a golden file reads");
+        let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+        let header = serde_json::from_slice(&bytes[8..8 + length]).expect("a golden header parses");
+        Some(GoldenTensors { header, data: bytes[8 + length..].to_vec(), path })
+    }
+
+    /// Whether there is a tensor `name`.
+    pub(crate) fn contains(&self, name: &str) -> bool {
+        self.header.get(name).is_some()
+    }
+
+    /// The tensor `name`, whatever its number type.
+    pub(crate) fn array(&self, name: &str) -> Array {
+        let entry = self
+            .header
+            .get(name)
+            .unwrap_or_else(|| panic!("{}: no tensor {name}", self.path.display()));
+        let sizes = |key: &str| -> Vec<usize> {
+            let list = entry[key].as_array().unwrap();
+            list.iter().map(|size| size.as_u64().unwrap() as usize).collect()
+        };
+        let place = sizes("data_offsets");
+        let data = &self.data[place[0]..place[1]];
+        let words = data.chunks_exact(4).map(|word| word.try_into().unwrap());
+        let values = match entry["dtype"].as_str().unwrap() {
+            "F32" => words.map(|word| f64::from(f32::from_le_bytes(word))).collect(),
+            "I32" => words.map(|word| f64::from(i32::from_le_bytes(word))).collect(),
+            "U8" => data.iter().map(|&value| f64::from(value)).collect(),
+            other => panic!("{name}: number type {other}"),
+        };
+        Array { shape: sizes("shape"), values }
+    }
+}

@@ -1,10 +1,10 @@
 //! Counting operations and values: each tensor of a network's layout is used once per pixel of the level that its name
 //! tells.
 
+use crate::checkpoint::Layout;
 use crate::diffusion::layout::BLOCKS_PER_LEVEL;
 use crate::diffusion::{
-    ControlNetConfig, Extent, LAYERS, Layout, PROMPT_LENGTH, UnetConfig, controlnet_layout,
-    unet_layout,
+    ControlNetConfig, Extent, LAYERS, PROMPT_LENGTH, UnetConfig, controlnet_layout, unet_layout,
 };
 
 /// Rows and columns of a latent image.

@@ -4,8 +4,9 @@ use rare::{Error, Result};
 
 use super::{GroupNormalization, LayerNormalization};
 use crate::Parameter;
+use crate::checkpoint::Layout;
 use crate::checkpoint::Parameters;
-use crate::diffusion::layout::{Layout, require};
+use crate::diffusion::layout::require;
 use crate::engine::{Arrangement, Backend, Kernel};
 
 /// Reads the tensors of one network and packs them for one backend, each when it is asked for: no more than the parts of

@@ -1,11 +1,14 @@
 //! What a weight file holds against what it should hold.
 
+use std::collections::BTreeMap;
 use std::fmt::{self, Display, Formatter};
 
 use rare::{Error, Result};
 
-use super::Layout;
-use crate::checkpoint::Parameters;
+use super::Parameters;
+
+/// The shape of every tensor of a network, by name.
+pub type Layout = BTreeMap<String, Vec<usize>>;
 
 /// How many tensors of each kind a message names.
 const NAMED: usize = 3;
@@ -58,18 +61,22 @@ pub fn compare(layout: &Layout, parameters: &Parameters) -> Differences {
     differences
 }
 
-/// Makes sure that weight files hold the tensors of `layout` and no others. `network` is its name for the message.
+/// Makes sure that weight files hold the tensors of `layout` and no others. `network` is its name for the message, which
+/// ends with the advice what to do.
 ///
 /// # Errors
 /// `InvalidInput` with the file and the first differences.
-pub(crate) fn require(layout: &Layout, parameters: &Parameters, network: &str) -> Result<()> {
+pub(crate) fn require(
+    layout: &Layout,
+    parameters: &Parameters,
+    network: &str,
+    advice: &str,
+) -> Result<()> {
     let differences = compare(layout, parameters);
     if differences.is_empty() {
         return Ok(());
     }
-    let what = format!(
-        "not the weights of the {network} that its configuration describes: {differences}; take weights and configuration of Stable Diffusion 1.5 from one source"
-    );
+    let what = format!("not the weights of {network}: {differences}; {advice}");
     match parameters.files().first() {
         Some(file) => Err(Error::in_file(file, what)),
         None => Err(Error::invalid(what)),

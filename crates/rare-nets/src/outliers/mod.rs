@@ -1,0 +1,1 @@
+//! Networks that tell right correspondences from wrong ones.
