@@ -8,7 +8,6 @@ use std::path::PathBuf;
 
 use clap::{Args, CommandFactory, Parser, Subcommand, ValueEnum};
 use clap_complete::Shell;
-use rare::InitialMethod;
 use serde::Serialize;
 
 pub(crate) use self::eval::{
@@ -18,7 +17,7 @@ pub(crate) use self::icp::{IcpArgs, TrimChoice};
 #[cfg(feature = "fetch")]
 pub(crate) use self::weights::FetchArgs;
 pub(crate) use self::weights::{CheckArgs, WeightsArgs, WeightsCommand};
-use crate::options::{Options, choice};
+use crate::options::{InitMethod, Options, choice};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -38,7 +37,9 @@ const REGISTER_EXAMPLES: &str = "\
 Examples:
   rare register scan1.ply scan2.ply > transform.txt
   rare register scan1.pcd scan2.pcd --save-aligned moved.ply --json evidence.json
-  rare register 000000.bin 000010.bin --profile lidar";
+  rare register 000000.bin 000010.bin --profile lidar
+  rare register scan1.ply scan2.ply --backbone geotransformer --weights geotransformer-3dmatch.pth.tar
+  rare register scan1.ply scan2.ply --init-method pointdsc --weights model_best.pkl";
 
 const REFINE_EXAMPLES: &str = "\
 Examples:
@@ -56,10 +57,14 @@ Examples:
   rare refine scan1.ply scan2.ply --init coarse.txt --depth-features pair.npz
   rare features scan1.ply --output scan1.npz --encoder diffusion --weights sd15
   rare features scan1.ply --output scan1.npz --camera overlap
+  rare features scan1.ply scan2.ply --backbone predator --weights indoor.pth --output pair.npz
+  rare refine scan1.ply scan2.ply --init coarse.txt --source-features pair.npz --reference-features pair.npz
 
 Of a pair, the features of all depth maps under the initial transform are written, for --depth-features.
 Of one cloud, the features of its own depth maps are written at the points that they show: `points` (N x 3, metres)
-and `features` (N x D), for --source-features and --reference-features.";
+and `features` (N x D), for --source-features and --reference-features.
+With --backbone NETWORK, the keypoints, features, correspondences and transform that it finds for a pair are written,
+for --source-features and --reference-features together, or for --correspondences.";
 
 /// Register point clouds and refine given registrations, with a verdict on the result
 #[derive(Debug, Parser)]
@@ -111,9 +116,10 @@ pub(crate) struct Clouds {
 pub(crate) struct RegisterArgs {
     #[command(flatten)]
     pub(crate) clouds: Clouds,
-    /// How the initial transform is estimated [default: sc2-pcr]
-    #[arg(long, value_name = "METHOD", value_parser = choice::<InitialMethod>(&["ransac", "sc2-pcr", "sc2-pcr++", "mac", "fast-mac"]))]
-    pub(crate) init_method: Option<InitialMethod>,
+    /// How the initial transform is estimated; pointdsc and vbreg are networks and need --weights [default: sc2-pcr;
+    /// with --backbone NETWORK: as its authors do]
+    #[arg(long, value_name = "METHOD", value_parser = choice::<InitMethod>(&["ransac", "sc2-pcr", "sc2-pcr++", "mac", "fast-mac", "pointdsc", "vbreg"]))]
+    pub(crate) init_method: Option<InitMethod>,
     #[command(flatten)]
     pub(crate) options: Options,
 }
@@ -156,7 +162,7 @@ pub(crate) struct FeaturesArgs {
     #[arg(value_name = "SRC")]
     pub(crate) source: PathBuf,
     /// The reference of a pair
-    #[arg(value_name = "REF", requires = "init")]
+    #[arg(value_name = "REF")]
     pub(crate) reference: Option<PathBuf>,
     /// The initial transform of the pair, in the formats of `rare refine`
     #[arg(long, value_name = "FILE", requires = "reference")]

@@ -6,7 +6,10 @@
 #![forbid(unsafe_code)]
 
 mod args;
+mod backbone;
+mod estimators;
 mod figures;
+mod given_weights;
 mod images;
 mod memory;
 mod network;

@@ -18,6 +18,7 @@ use rare_nets::engine::CpuBackend;
 use rare_nets::weights::Choice;
 use serde::Serialize;
 
+use crate::given_weights::GivenWeights;
 use crate::options::{Diffusion, Settings};
 use crate::progress::{Passes, Progress, duration_in_words};
 use crate::{memory, speed, summary};
@@ -86,10 +87,10 @@ impl OpenPipeline {
     ///
     /// # Errors
     /// If there is none, if it does not fit, or if the settings are impossible with it.
-    pub(crate) fn of(settings: &Settings) -> Result<Option<OpenPipeline>> {
+    pub(crate) fn of(settings: &Settings, weights: &GivenWeights) -> Result<Option<OpenPipeline>> {
         let Some(diffusion) = settings.diffusion.clone() else { return Ok(None) };
-        let weights = match &diffusion.weights {
-            Some(folder) => folder.clone(),
+        let weights = match weights.diffusion()? {
+            Some(folder) => folder.to_owned(),
             None => Choice::default().default_folder(|name| env::var_os(name))?,
         };
         let pipeline = Pipeline::open(&weights)

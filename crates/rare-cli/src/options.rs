@@ -4,6 +4,7 @@
 //! that nothing else in the program has to know a default.
 
 mod diffusion;
+mod networks;
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,9 +14,11 @@ use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 pub(crate) use diffusion::Diffusion;
 use diffusion::DiffusionOptions;
+pub(crate) use networks::{Backbone, BackboneChoice, Filter, InitMethod};
 use rare::scale::Profile;
 use rare::viewpoints::CameraChoice;
-use rare::{InitialMethod, Recipe, RefinerConfig};
+use rare::{Recipe, RefinerConfig};
+use rare_nets::backbones::SelectionRule;
 use serde::de::value::{Error as ValueError, StringDeserializer};
 use serde::de::{DeserializeOwned, IntoDeserializer};
 use serde::{Deserialize, Serialize};
@@ -59,6 +62,25 @@ pub(crate) struct Options {
     /// Recorded features of the depth maps (NPZ), made under the very same initial transform; `refine` only
     #[arg(long, value_name = "FILE")]
     pub(crate) depth_features: Option<PathBuf>,
+    /// What describes the clouds in 3D: built-in histograms, or a network, whose own transform is the initial one where
+    /// none is given [default: fpfh]
+    #[arg(long, value_name = "NETWORK", value_parser = choice::<BackboneChoice>(&["fpfh", "geotransformer", "predator", "cofinet", "fcgf"]))]
+    pub(crate) backbone: Option<BackboneChoice>,
+    /// Weights of the networks that are used, a checkpoint of their authors or the folder of a diffusion pipeline; may be
+    /// given several times, each is recognised by its content
+    #[arg(long, value_name = "PATH")]
+    #[serde(deserialize_with = "networks::one_or_more")]
+    pub(crate) weights: Vec<PathBuf>,
+    /// Most 3D keypoints of a cloud [default: 500, streets 1000]
+    #[arg(long, value_name = "N")]
+    pub(crate) keypoints: Option<usize>,
+    /// Which keypoints or correspondences of a network are taken [default: top-score]
+    #[arg(long, value_name = "RULE", value_parser = choice::<SelectionRule>(&["top-score", "random"]))]
+    pub(crate) keypoint_rule: Option<SelectionRule>,
+    /// Most neighbours of a point in a network, stage by stage [default: those of its authors; for streets, which they
+    /// never published, by their rule from the clouds]
+    #[arg(long, value_name = "N,N,...", value_delimiter = ',')]
+    pub(crate) neighbor_limits: Option<Vec<usize>>,
     /// How often the clouds are looked at and matched, each time under the transform found before [default: 2; with
     /// --preset paper or --encoder recorded: 1]
     #[arg(long, value_name = "N")]
@@ -74,7 +96,7 @@ pub(crate) struct Options {
     pub(crate) no_polish: Option<bool>,
     /// A flag of `register` alone; here so that one file serves both commands.
     #[arg(skip)]
-    pub(crate) init_method: Option<InitialMethod>,
+    pub(crate) init_method: Option<InitMethod>,
     /// Seed of all random choices; the same seed gives the same result [default: 0]
     #[arg(long, value_name = "N")]
     pub(crate) seed: Option<u64>,
@@ -122,7 +144,12 @@ pub(crate) struct Settings {
     pub(crate) depth_features: Option<PathBuf>,
     /// The settings of `Encoder::Diffusion`.
     pub(crate) diffusion: Option<Diffusion>,
-    pub(crate) init_method: InitialMethod,
+    /// The network that describes the clouds.
+    pub(crate) backbone: Option<Backbone>,
+    /// Weights of the networks, in the order given.
+    pub(crate) weights: Vec<PathBuf>,
+    /// How the initial transform is estimated, if that was said.
+    pub(crate) init_method: Option<InitMethod>,
     /// 0: as many as there are cores.
     pub(crate) threads: usize,
     pub(crate) quiet: bool,
@@ -171,6 +198,7 @@ impl Options {
 
     fn settings(self, encoder: Encoder) -> Result<Settings> {
         let refiner = self.refiner(encoder)?;
+        let backbone = self.resolve_backbone()?;
         let paper = self.preset == Some(Preset::Paper);
         let diffusion = match encoder {
             Encoder::Diffusion => Some(self.diffusion.resolve(paper, refiner.seed)?),
@@ -182,7 +210,9 @@ impl Options {
             encoder,
             depth_features: self.depth_features.filter(|_| encoder == Encoder::Recorded),
             diffusion,
-            init_method: self.init_method.unwrap_or_default(),
+            backbone,
+            weights: self.weights,
+            init_method: self.init_method,
             threads: self.threads.unwrap_or(0),
             quiet: self.quiet.unwrap_or(false),
             verbose: self.verbose.unwrap_or(false),
@@ -219,6 +249,11 @@ impl Options {
             voxel: self.voxel.or(other.voxel),
             encoder: self.encoder.or(other.encoder),
             depth_features: self.depth_features.or(other.depth_features),
+            backbone: self.backbone.or(other.backbone),
+            weights: if self.weights.is_empty() { other.weights } else { self.weights },
+            keypoints: self.keypoints.or(other.keypoints),
+            keypoint_rule: self.keypoint_rule.or(other.keypoint_rule),
+            neighbor_limits: self.neighbor_limits.or(other.neighbor_limits),
             rounds: self.rounds.or(other.rounds),
             no_verify: self.no_verify.or(other.no_verify),
             no_search: self.no_search.or(other.no_search),
@@ -265,6 +300,7 @@ impl Options {
             seed: self.seed.unwrap_or(0),
             recipe: Recipe {
                 rounds: self.rounds(encoder, recipe.rounds)?,
+                keypoints: self.keypoints.or(recipe.keypoints),
                 ..self.without_steps(&recipe)
             },
         })

@@ -10,6 +10,7 @@ use rare::viewpoints::CameraChoice;
 use rare::{Recipe, RigidTransform};
 use serde::{Serialize, Serializer};
 
+use crate::backbone::BackboneRecord;
 use crate::network::NetworkRecord;
 use crate::options::{Encoder, Preset, Settings};
 use crate::run::{Inputs, Registration};
@@ -60,6 +61,8 @@ struct Config<'a> {
     depth_features: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     diffusion: Option<&'a NetworkRecord>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    backbone: Option<&'a BackboneRecord>,
     threads: usize,
     recipe: &'a Recipe,
     scale: Scale,
@@ -189,6 +192,7 @@ fn config(registration: &Registration) -> Config<'_> {
         encoder: settings.encoder,
         depth_features: settings.depth_features.as_ref().map(|file| file.display().to_string()),
         diffusion: registration.network.as_ref(),
+        backbone: registration.backbone.as_ref(),
         threads: rayon::current_num_threads(),
         recipe: &settings.refiner.recipe,
         scale,

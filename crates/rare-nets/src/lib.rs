@@ -5,6 +5,7 @@
 //! | [`engine`] | tensors, operations of fused size, kernels for each processor |
 //! | [`checkpoint`] | weight files, read without executing anything |
 //! | [`backbones`] | networks that describe and match two clouds |
+//! | [`networks`] | the networks on points by name: which one a weight file is of |
 //! | [`outliers`] | networks that tell right correspondences from wrong ones |
 //! | [`cache`] | features that were computed before |
 //! | [`diffusion`] | Stable Diffusion 1.5 with a depth `ControlNet`: features of depth maps |
@@ -22,6 +23,7 @@ pub mod engine;
 #[allow(dead_code)]
 mod layers;
 mod matrix;
+pub mod networks;
 pub mod official;
 pub mod outliers;
 mod parameter;

@@ -25,6 +25,8 @@ Examples:
   rare eval folder redkitchen --init init_ransac.json --out results --jobs 4 --shard 0/2
   rare eval 3dmatch data --init cofinet/5000 --out results
   rare eval kitti data --limit 20 --out results
+  rare eval 3dmatch data --backbone geotransformer --weights geotransformer-3dmatch.pth.tar --out results
+  rare eval paper data --weights geotransformer-3dmatch.pth.tar --weights predator/indoor.pth --out paper
 
 Every result is written as soon as it is known: the same command goes on where it was interrupted.";
 
@@ -120,9 +122,9 @@ pub(crate) struct EvalArgs {
     pub(crate) root: PathBuf,
     /// The initial transforms: a JSON file of the folder layout, an est.log, a folder of scenes
     /// with est.log or with what official runs left, or how they are
-    /// estimated (sc2-pcr, ransac, ...)
-    #[arg(long, value_name = "FILE|DIR|METHOD", default_value = "sc2-pcr")]
-    pub(crate) init: String,
+    /// estimated (sc2-pcr, ransac, ...) [default: sc2-pcr; with --backbone NETWORK: its own]
+    #[arg(long, value_name = "FILE|DIR|METHOD")]
+    pub(crate) init: Option<String>,
     /// What is compared, separated by commas
     #[arg(long, value_name = "METHODS", value_delimiter = ',', default_value = "init,refine")]
     pub(crate) methods: Vec<String>,
@@ -162,7 +164,7 @@ pub(crate) enum DatasetKind {
     /// 3DLoMatch: the same with the pairs of 10 to 30 % overlap
     #[value(name = "3dlomatch")]
     ThreeDLoMatch,
-    /// The tables of the paper, as far as the data goes: these benchmarks, and features/NETWORK/BENCHMARK with what official runs of the networks left
+    /// The tables of the paper, as far as the data goes: these benchmarks, and features/NETWORK/BENCHMARK with what official runs of the networks left, or --weights of the networks
     Paper,
     /// KITTI odometry: sequences 8, 9 and 10, scans as velodyne/*.bin
     Kitti,

@@ -38,7 +38,8 @@ pub(crate) enum WeightsCommand {
     /// Download the weights of the diffusion features into a folder
     #[cfg(feature = "fetch")]
     Fetch(FetchArgs),
-    /// Compare a folder with the record that was made when it was fetched, and open it
+    /// Say which network a checkpoint is of and whether it is whole; or compare a folder with the record that was made when
+    /// it was fetched, and open it
     Check(CheckArgs),
 }
 
@@ -65,7 +66,7 @@ pub(crate) struct FetchArgs {
 
 #[derive(Debug, Args)]
 pub(crate) struct CheckArgs {
-    /// The folder [default: the one that `rare weights fetch` makes]
-    #[arg(value_name = "DIR")]
-    pub(crate) folder: Option<PathBuf>,
+    /// A checkpoint, or a folder [default: the one that `rare weights fetch` makes]
+    #[arg(value_name = "FILE|DIR")]
+    pub(crate) path: Option<PathBuf>,
 }

@@ -15,9 +15,6 @@ use super::choice;
 #[serde(default, deny_unknown_fields, rename_all = "kebab-case")]
 #[command(next_help_heading = "Options of --encoder diffusion")]
 pub(crate) struct DiffusionOptions {
-    /// The folder of a Stable Diffusion 1.5 pipeline with a depth ControlNet [default: where `rare weights` puts it]
-    #[arg(long, value_name = "DIR")]
-    pub(crate) weights: Option<PathBuf>,
     /// How much is computed; the following options change single settings of it [default: single-step; with
     /// --preset paper: paper]
     #[arg(id = "diffusion", long = "diffusion", value_name = "PRESET", value_parser = choice::<Preset>(&["paper", "no-guidance", "few-steps", "single-step"]))]
@@ -57,8 +54,6 @@ pub(crate) struct DiffusionOptions {
 /// The diffusion features with nothing left open but the prompt, which needs the clouds.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Diffusion {
-    /// The pipeline's folder, if it was named.
-    pub(crate) weights: Option<PathBuf>,
     pub(crate) settings: DiffusionSettings,
     pub(crate) cache: Option<PathBuf>,
 }
@@ -67,7 +62,6 @@ impl DiffusionOptions {
     /// These options, and where one is open that of `other`.
     pub(super) fn or(self, other: DiffusionOptions) -> DiffusionOptions {
         DiffusionOptions {
-            weights: self.weights.or(other.weights),
             preset: self.preset.or(other.preset),
             layers: self.layers.or(other.layers),
             prompt: self.prompt.or(other.prompt),
@@ -105,6 +99,6 @@ impl DiffusionOptions {
             precision: self.precision.unwrap_or(default.precision),
         };
         settings.validate()?;
-        Ok(Diffusion { weights: self.weights, settings, cache: self.cache })
+        Ok(Diffusion { settings, cache: self.cache })
     }
 }

@@ -2,6 +2,7 @@
 
 use rare::scale::Profile;
 use rare::viewpoints::CameraChoice;
+use rare_nets::backbones::SelectionRule;
 
 use crate::args::Direction;
 use crate::options::{Encoder, Preset};
@@ -13,7 +14,11 @@ pub(super) fn line(registration: &Registration) -> String {
     let mut words = vec!["rare".to_owned()];
     let (command, start) = match &inputs.start {
         Start::Estimated { init_method } => {
-            ("register", option("--init-method", name_of(init_method)))
+            let method = init_method.iter();
+            (
+                "register",
+                method.flat_map(|method| option("--init-method", name_of(method))).collect(),
+            )
         }
         Start::Given {
             init,
@@ -64,6 +69,18 @@ fn settings(registration: &Registration) -> Vec<String> {
     if settings.encoder == Encoder::Diffusion {
         words.extend(option("--encoder", settings.encoder.name().to_owned()));
     }
+    if let Some(backbone) = &settings.backbone {
+        words.extend(option("--backbone", backbone.network.name().to_owned()));
+        if backbone.rule != SelectionRule::default() {
+            words.extend(option("--keypoint-rule", name_of(&backbone.rule)));
+        }
+        let limits = backbone.neighbour_limits.iter();
+        words.extend(limits.flat_map(|limits| option("--neighbor-limits", joined(limits))));
+    }
+    let weights = settings.weights.iter();
+    words.extend(weights.flat_map(|path| option("--weights", path.display().to_string())));
+    let keypoints = recipe.keypoints.iter();
+    words.extend(keypoints.flat_map(|count| option("--keypoints", count.to_string())));
     let recorded = settings.depth_features.iter();
     words.extend(recorded.flat_map(|file| option("--depth-features", file.display().to_string())));
     if settings.preset == Preset::Default && settings.encoder == Encoder::Builtin {
@@ -76,6 +93,10 @@ fn settings(registration: &Registration) -> Vec<String> {
         words.extend(flag(!recipe.polish, "--no-polish"));
     }
     words
+}
+
+fn joined(numbers: &[usize]) -> String {
+    numbers.iter().map(usize::to_string).collect::<Vec<_>>().join(",")
 }
 
 fn option(name: &str, value: String) -> Vec<String> {

@@ -11,13 +11,17 @@ mod start;
 mod work;
 
 use anyhow::{Result, bail};
-use method::Method;
+use method::{Filters, Method};
+use rare::InitialMethod;
 use rare::eval::dataset::{self, Dataset};
 use rare::eval::results::{self, Benchmark, ResultsFolder};
+use rare_nets::networks::Network;
 use serde_json::json;
 use start::Starts;
 
 use crate::args::{DatasetKind, EvalArgs, Format};
+use crate::backbone::OpenBackbone;
+use crate::given_weights::GivenWeights;
 use crate::options::{Encoder, Settings};
 use crate::report::{self, Index};
 use crate::{SUCCESS, run, summary};
@@ -28,6 +32,8 @@ struct Plan {
     starts: Starts,
     methods: Vec<Method>,
     settings: Settings,
+    /// The network that describes the clouds.
+    backbone: Option<OpenBackbone>,
     /// The pairs of this shard.
     pairs: Vec<usize>,
     jobs: usize,
@@ -78,11 +84,20 @@ impl Plan {
     fn new(args: &EvalArgs) -> Result<Plan> {
         let dataset = read_dataset(args)?;
         let settings = resolve(args)?;
-        let methods = Method::parse_all(&args.methods, &settings)?;
-        let starts = Starts::read(&args.init, &args.root, &dataset)?;
+        let weights = GivenWeights::read(&settings.weights)?;
+        check_weights(&weights, &settings, &args.methods)?;
+        let filters = Filters { weights: &weights, trained_on: None };
+        let methods = Method::parse_all(&args.methods, &settings, &filters)?;
+        let backbone = open_backbone(&settings, &weights)?;
+        let starts = match (&args.init, &backbone) {
+            (Some(init), _) => Starts::read(init, &args.root, &dataset)?,
+            (None, Some(_)) => Starts::Described,
+            (None, None) => Starts::Estimated(InitialMethod::default()),
+        };
         let (index, count) = args.shard.unwrap_or((0, 1));
         let pairs = (0..dataset.pairs.len()).skip(index).step_by(count).collect();
-        Ok(Plan { dataset, starts, methods, settings, pairs, jobs: usize::from(args.jobs) })
+        let jobs = usize::from(args.jobs);
+        Ok(Plan { dataset, starts, methods, settings, backbone, pairs, jobs })
     }
 
     /// What the results depend on.
@@ -92,12 +107,28 @@ impl Plan {
             protocol: self.dataset.protocol,
             settings: json!({
                 "start": self.starts.description(),
+                "backbone": self.backbone.as_ref().map(OpenBackbone::record),
                 "refiner": serde_json::to_value(&self.settings.refiner)?,
                 "version": env!("CARGO_PKG_VERSION"),
             }),
             pairs: self.dataset.pairs.iter().map(|pair| (&pair.truth).into()).collect(),
         })
     }
+}
+
+/// Makes sure that there is a use for all weights.
+fn check_weights(weights: &GivenWeights, settings: &Settings, methods: &[String]) -> Result<()> {
+    let backbone = settings.backbone.as_ref().map(|backbone| backbone.network);
+    let filters = [Network::PointDsc, Network::Vbreg];
+    let filters = filters.into_iter().filter(|network| methods.iter().any(|m| m == network.name()));
+    let used: Vec<Network> = backbone.into_iter().chain(filters).collect();
+    weights.check_use(settings, &used)
+}
+
+fn open_backbone(settings: &Settings, weights: &GivenWeights) -> Result<Option<OpenBackbone>> {
+    let Some(backbone) = &settings.backbone else { return Ok(None) };
+    let file = weights.of(backbone.network, &format!("--backbone {}", backbone.network.name()))?;
+    OpenBackbone::open(file, backbone, settings).map(Some)
 }
 
 /// The settings of the refiner, whose features are the built-in ones.

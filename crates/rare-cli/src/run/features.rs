@@ -6,6 +6,8 @@ use anyhow::{Context, Result, bail};
 use rare::io as files;
 
 use crate::args::{Clouds, FeaturesArgs};
+use crate::backbone::{Described, OpenNetworks};
+use crate::given_weights::GivenWeights;
 use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::Settings;
 use crate::progress::Progress;
@@ -20,13 +22,29 @@ pub(super) fn run(args: FeaturesArgs) -> Result<u8> {
     let inputs: Vec<&Path> = inputs.into_iter().flatten().map(PathBuf::as_path).collect();
     check_outputs(&settings, &inputs)?;
     start_threads(&settings)?;
+    let weights = GivenWeights::read(&settings.weights)?;
     let written = match (args.reference, args.init) {
+        (reference, None) if settings.backbone.is_some() => {
+            let Some(reference) = reference else {
+                bail!("a network looks at both clouds together: name the reference as well")
+            };
+            let clouds = Clouds { source: args.source, reference };
+            by_network(&clouds, &settings, &weights, output)?
+        }
+        (_, Some(_)) if settings.backbone.is_some() => {
+            bail!(
+                "--backbone describes the clouds themselves, whatever lies between them: leave out --init"
+            )
+        }
+        (Some(_), None) => bail!(
+            "the depth maps of a pair are seen under an initial transform: add --init FILE (or --backbone NETWORK)"
+        ),
         (Some(reference), Some(init)) => {
             let clouds = Clouds { source: args.source, reference };
             let initial = read_initial(&init, args.init_direction)?;
-            of_pair(&clouds, &initial, &settings, output)?
+            of_pair(&clouds, &initial, &settings, &weights, output)?
         }
-        _ => of_cloud(&args.source, &settings, output)?,
+        (None, _) => of_cloud(&args.source, &settings, &weights, output)?,
     };
     if !settings.quiet {
         summary::say(&format!("wrote {written} to {}", output.display()));
@@ -51,11 +69,12 @@ fn of_pair(
     clouds: &Clouds,
     initial: &rare::RigidTransform,
     settings: &Settings,
+    weights: &GivenWeights,
     output: &Path,
 ) -> Result<String> {
     let progress = Progress::start(settings.quiet);
     progress.step("read");
-    let pipeline = OpenPipeline::of(settings)?;
+    let pipeline = OpenPipeline::of(settings, weights)?;
     let (source, reference) = (read_scan(&clouds.source)?, read_scan(&clouds.reference)?);
     let (refiner, network) =
         network::refiner(pipeline, [&source, &reference], settings, &progress)?;
@@ -70,10 +89,51 @@ fn of_pair(
     Ok(format!("the features of {} depth maps ({layers} layers each)", maps.len()))
 }
 
-fn of_cloud(cloud: &Path, settings: &Settings, output: &Path) -> Result<String> {
+/// What a network on points says of a pair.
+fn by_network(
+    clouds: &Clouds,
+    settings: &Settings,
+    weights: &GivenWeights,
+    output: &Path,
+) -> Result<String> {
     let progress = Progress::start(settings.quiet);
     progress.step("read");
-    let pipeline = OpenPipeline::of(settings)?;
+    let networks = OpenNetworks::of(settings, weights)?;
+    let (mut source, mut reference) = (read_scan(&clouds.source)?, read_scan(&clouds.reference)?);
+    let described = networks.describe(&mut source, &mut reference, &progress);
+    let Some(Described { description, .. }) = described.with_context(|| which(clouds))? else {
+        bail!("--backbone names no network")
+    };
+    if !settings.quiet {
+        let warnings = description.warnings.iter();
+        warnings.for_each(|warning| summary::say(&format!("warning: {warning}")));
+    }
+    let pair = files::PairFeatures {
+        source: (&description.source.features, &description.source.scores),
+        reference: (&description.target.features, &description.target.scores),
+        correspondences: &description.correspondences,
+        target_from_source: description.target_from_source.as_ref().ok(),
+    };
+    files::write_pair_features(output, &pair)?;
+    Ok(format!(
+        "{} and {} keypoints with {} features each, {} correspondences and {} transform",
+        pair.source.0.len(),
+        pair.reference.0.len(),
+        pair.source.0.dimension(),
+        pair.correspondences.len(),
+        if pair.target_from_source.is_some() { "a" } else { "no" }
+    ))
+}
+
+fn of_cloud(
+    cloud: &Path,
+    settings: &Settings,
+    weights: &GivenWeights,
+    output: &Path,
+) -> Result<String> {
+    let progress = Progress::start(settings.quiet);
+    progress.step("read");
+    let pipeline = OpenPipeline::of(settings, weights)?;
     let scan = read_scan(cloud)?;
     let (refiner, network) = network::refiner(pipeline, [&scan, &scan], settings, &progress)?;
     let features = refiner.point_features(&scan).with_context(|| cloud.display().to_string())?;

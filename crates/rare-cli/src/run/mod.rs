@@ -13,18 +13,19 @@ mod score;
 mod weights;
 
 use std::io::{self, ErrorKind, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use rare::refine::Illustration;
 use rare::verify::Verdict;
-use rare::{InitialMethod, Refinement, Refiner, RigidTransform, Scan, io as files};
+use rare::{Refinement, Refiner, RigidTransform, Scan, io as files};
 use rare_nets::official;
 use serde::Serialize;
 
 use crate::args::{Cli, Clouds, Command, Direction};
+use crate::backbone::BackboneRecord;
 use crate::network::NetworkRecord;
-use crate::options::Settings;
+use crate::options::{InitMethod, Settings};
 use crate::outputs::{self, Output};
 use crate::progress::Progress;
 use crate::{NO_POSE, SUCCESS, figures, record, report, summary};
@@ -57,8 +58,10 @@ pub(crate) struct Registration {
     pub(crate) refinement: Refinement,
     /// What was seen and matched, if a report or figures were asked for.
     pub(crate) illustration: Option<Illustration>,
-    /// The networks that were used.
+    /// The diffusion networks that were used.
     pub(crate) network: Option<NetworkRecord>,
+    /// The network that described the clouds.
+    pub(crate) backbone: Option<BackboneRecord>,
     pub(crate) read_seconds: f64,
     pub(crate) total_seconds: f64,
 }
@@ -76,8 +79,10 @@ pub(crate) struct Inputs {
 #[derive(Serialize)]
 #[serde(untagged)]
 pub(crate) enum Start {
+    /// As a network does that describes the clouds, if nothing is said.
     Estimated {
-        init_method: InitialMethod,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        init_method: Option<InitMethod>,
     },
     Given {
         init: String,
@@ -160,7 +165,8 @@ fn check_outputs(settings: &Settings, inputs: &[&Path]) -> Result<()> {
     let outputs: Vec<Output<'_>> = named.into_iter().filter_map(output).collect();
     let configured = [&settings.config, &settings.depth_features];
     let configured = configured.into_iter().filter_map(Option::as_deref);
-    let read: Vec<&Path> = inputs.iter().copied().chain(configured).collect();
+    let weights = settings.weights.iter().map(PathBuf::as_path);
+    let read: Vec<&Path> = inputs.iter().copied().chain(configured).chain(weights).collect();
     outputs::check(&read, &outputs)?;
     if let Some(folder) = &settings.figures {
         outputs::check_folder("--figures", folder)?;

@@ -3,11 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use rare::encode::Recorded;
+use rare::refine::Timing;
 use rare::{Correspondence, Refinement, Refiner, RigidTransform, Scan, io as files};
 
 use crate::args::{Clouds, Direction, RefineArgs, Start};
+use crate::backbone::{Described, OpenNetworks};
+use crate::given_weights::GivenWeights;
 use crate::network::{self, NetworkEncoder, OpenPipeline};
 use crate::options::Settings;
 use crate::progress::Progress;
@@ -17,9 +20,25 @@ use crate::run::{
 
 pub(super) fn run(args: RefineArgs) -> Result<u8> {
     let settings = args.options.resolve()?;
+    check_features(&args.start, &settings)?;
     check_outputs(&settings, &inputs(&args.clouds, &args.start))?;
     start_threads(&settings)?;
     registration(&args.clouds, &args.start, settings)?.finish()
+}
+
+/// Features of a file and of a network at once have no meaning.
+fn check_features(start: &Start, settings: &Settings) -> Result<()> {
+    let given = [
+        ("--source-features", start.source_features.is_some()),
+        ("--correspondences", start.correspondences.is_some()),
+    ];
+    match (given.into_iter().find(|(_, given)| *given), &settings.backbone) {
+        (Some((option, _)), Some(backbone)) => bail!(
+            "{option} and --backbone {} both say what matches: leave out one of them",
+            backbone.network.name()
+        ),
+        _ => Ok(()),
+    }
 }
 
 /// All files that are read.
@@ -39,6 +58,7 @@ struct Problem {
     initial: RigidTransform,
     correspondences: Option<Vec<Correspondence>>,
     recorded: Option<Recorded>,
+    networks: OpenNetworks,
     pipeline: Option<OpenPipeline>,
 }
 
@@ -52,6 +72,7 @@ pub(super) fn registration(
     progress.step("read");
     let mut problem = read(clouds, start, &mut settings)?;
     let read_seconds = clock.elapsed().as_secs_f64();
+    let described = problem.describe(&progress).with_context(|| which(clouds))?;
     let clouds_read = [&problem.source, &problem.reference];
     let (refiner, network) =
         network::refiner(problem.pipeline.take(), clouds_read, &settings, &progress)?;
@@ -61,6 +82,11 @@ pub(super) fn registration(
     };
     let mut refinement = problem.solve(&refiner).with_context(|| which(clouds))?;
     refinement.warnings.extend(network.iter().flat_map(NetworkEncoder::warnings));
+    if let Some(described) = &described {
+        refinement.warnings.extend(described.description.warnings.iter().cloned());
+        let timing = Timing { step: "describe".to_owned(), seconds: described.seconds };
+        refinement.timings.insert(0, timing);
+    }
     let network = network.as_ref().map(NetworkEncoder::record);
     let total_seconds = clock.elapsed().as_secs_f64();
     let scans = [&problem.source, &problem.reference];
@@ -75,6 +101,7 @@ pub(super) fn registration(
         refinement,
         illustration,
         network,
+        backbone: described.map(|described| described.record),
         read_seconds,
         total_seconds,
     })
@@ -84,12 +111,14 @@ fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Probl
     // The small files first: what is wrong with them need not wait for the clouds.
     let initial = read_initial(&start.init, start.init_direction)?;
     let recorded = read_recorded(settings, &initial)?;
-    let pipeline = OpenPipeline::of(settings)?;
-    let features = |file: &Option<PathBuf>| -> rare::Result<_> {
-        file.as_ref().map(files::read_point_features).transpose()
+    let weights = GivenWeights::read(&settings.weights)?;
+    let networks = OpenNetworks::of(settings, &weights)?;
+    let pipeline = OpenPipeline::of(settings, &weights)?;
+    let features = |file: &Option<PathBuf>, side| -> rare::Result<_> {
+        file.as_ref().map(|file| files::read_features_of_side(file, side)).transpose()
     };
-    let source_features = features(&start.source_features)?;
-    let reference_features = features(&start.reference_features)?;
+    let source_features = features(&start.source_features, files::Side::Source)?;
+    let reference_features = features(&start.reference_features, files::Side::Reference)?;
     let correspondences =
         start.correspondences.as_ref().map(files::read_correspondences).transpose()?;
     Ok(Problem {
@@ -98,6 +127,7 @@ fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Probl
         initial,
         correspondences,
         recorded,
+        networks,
         pipeline,
     })
 }
@@ -121,6 +151,11 @@ pub(super) fn read_initial(init: &Path, direction: Direction) -> Result<RigidTra
 }
 
 impl Problem {
+    /// Lets a network describe the clouds, if one is to.
+    fn describe(&mut self, progress: &Progress) -> rare::Result<Option<Described>> {
+        self.networks.describe(&mut self.source, &mut self.reference, progress)
+    }
+
     fn solve(&self, refiner: &Refiner) -> rare::Result<Refinement> {
         let Problem { source, reference, initial, .. } = self;
         match &self.correspondences {

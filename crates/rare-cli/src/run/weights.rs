@@ -1,5 +1,6 @@
 //! `rare weights`: what can be used, getting it, and whether it is intact.
 
+mod checkpoint;
 #[cfg(feature = "fetch")]
 mod fetch;
 
@@ -56,7 +57,8 @@ fn describe(source: &Source) -> String {
 /// Prints the hash and name of every file, as `sha256sum` does, if all are what was fetched and the networks can use
 /// them.
 fn check(args: CheckArgs) -> Result<u8> {
-    let folder = match args.folder {
+    let folder = match args.path {
+        Some(file) if file.is_file() => return checkpoint::check(&file),
         Some(folder) => folder,
         None => default_folder(Choice::default())?,
     };

@@ -8,6 +8,8 @@
 //! | module | network | pose of its own |
 //! |---|---|---|
 
+use crate::checkpoint::Parameters;
+use crate::networks::{Network, TrainedOn};
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
 use serde::{Deserialize, Serialize};
@@ -23,8 +25,22 @@ pub struct Description {
     pub correspondences: Vec<Correspondence>,
     /// What the method itself makes of the correspondences: moves points of the source into the target's frame.
     pub target_from_source: Result<RigidTransform>,
+    /// Most neighbours that each stage looked at, for networks of kernel point convolutions.
+    pub neighbour_limits: Option<Vec<usize>>,
     /// What the caller should know, in words.
     pub warnings: Vec<String>,
+}
+
+/// What is asked of a network.
+#[derive(Debug, Clone, Default)]
+pub struct Request {
+    /// How many keypoints or correspondences, and which.
+    pub selection: Selection,
+    /// Most neighbours of a point, stage by stage, for networks of kernel point convolutions; those of the authors, or
+    /// by their rule from the clouds, if `None`.
+    pub neighbour_limits: Option<Vec<usize>>,
+    /// Bytes that may be taken; clouds that need more are refused beforehand.
+    pub memory: Option<u64>,
 }
 
 /// Keypoints of one cloud.
@@ -65,6 +81,42 @@ impl Default for Selection {
     }
 }
 
+/// A network with its weights.
+pub struct Backbone {
+    network: Network,
+    trained_on: TrainedOn,
+}
+
+impl Backbone {
+    /// Loads a network.
+    ///
+    /// # Errors
+    /// If the weights are of another network, or damaged; `Internal` if the network is none of this kind.
+    pub fn load(network: Network, _parameters: &Parameters) -> Result<Backbone> {
+        Err(rare::Error::Internal(format!("{network} describes no clouds")))
+    }
+
+    /// What the weights were trained on.
+    #[must_use]
+    pub fn trained_on(&self) -> TrainedOn {
+        self.trained_on
+    }
+
+    /// Finds keypoints, features, correspondences and a pose of two clouds.
+    ///
+    /// # Errors
+    /// `InvalidInput` if the clouds have too few points, would need more memory than there is, or the limits do not
+    /// fit.
+    pub fn describe(
+        &self,
+        _source: &PointCloud,
+        _target: &PointCloud,
+        _request: &Request,
+    ) -> Result<Description> {
+        Err(rare::Error::Internal(format!("{} describes no clouds", self.network)))
+    }
+}
+
 impl Description {
     /// From the local frames of the clouds, in which networks compute, to those of the caller.
     fn into_world(self, source: &PointCloud, target: &PointCloud) -> Description {
@@ -81,6 +133,7 @@ impl Description {
             target_from_source: self
                 .target_from_source
                 .map(|pose| PointCloud::to_world(target, source, &pose)),
+            neighbour_limits: self.neighbour_limits,
             warnings: self.warnings,
         }
     }

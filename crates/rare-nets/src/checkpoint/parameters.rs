@@ -42,7 +42,8 @@ impl Parameters {
     }
 
     /// Opens a file of `torch.save` and takes the dictionary of tensors in it: that under `state_dict`, else that under
-    /// `model`, else the object itself. Names stay as they are; entries that are not tensors are left out.
+    /// `model`, else the object itself. Names stay as they are; entries that are not tensors are left out. Numbers and
+    /// texts under `config` become metadata: the settings of the training.
     ///
     /// # Errors
     /// Those of [`open_pickle`], and `InvalidInput` if there is no such dictionary.
@@ -52,7 +53,7 @@ impl Parameters {
         let tensors =
             candidates.into_iter().flatten().map(named_tensors).find(|found| !found.is_empty());
         match tensors {
-            Some(tensors) => Ok(Parameters::from_tensors(path, tensors, BTreeMap::new())),
+            Some(tensors) => Ok(Parameters::from_tensors(path, tensors, settings(&object))),
             None => Err(Error::in_file(
                 path,
                 "holds no dictionary of tensors, neither itself nor under state_dict or model",
@@ -194,6 +195,23 @@ impl Parameters {
             None => Error::invalid(what),
         }
     }
+}
+
+/// Numbers and texts under `config`.
+fn settings(object: &Object) -> BTreeMap<String, String> {
+    let Some(config) = object.get("config") else { return BTreeMap::new() };
+    let text = |value: &Object| match value {
+        Object::Bool(value) => Some(value.to_string()),
+        Object::Integer(value) => Some(value.to_string()),
+        Object::Float(value) => Some(value.to_string()),
+        Object::Text(value) => Some(value.to_string()),
+        _ => None,
+    };
+    let settings = config
+        .entries()
+        .iter()
+        .filter_map(|(name, value)| Some((format!("config.{}", name.text()?), text(value)?)));
+    settings.collect()
 }
 
 /// The tensors among the entries of a dictionary.

@@ -8,7 +8,7 @@ use nalgebra::{Matrix4, Point3};
 use super::npy::Array;
 use super::npz::{self, Entry, NpzFile};
 use super::whole_file::write_whole;
-use crate::data::{Correspondence, PointFeatures};
+use crate::data::{Correspondence, PointFeatures, RigidTransform};
 use crate::encode::{MapSummary, Recorded, Recording, map_names};
 use crate::error::{Error, Result};
 
@@ -19,19 +19,88 @@ use crate::error::{Error, Result};
 /// `Io` if the file cannot be read, `InvalidInput` if an array is missing, has another shape or a number that is not
 /// finite.
 pub fn read_point_features(path: impl AsRef<Path>) -> Result<PointFeatures> {
+    read_named_features(path.as_ref(), "points", "features")
+}
+
+/// One of the clouds of a pair that features belong to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// The cloud that is moved.
+    Source,
+    /// The cloud that stays.
+    Reference,
+}
+
+/// Reads what [`read_point_features`] reads, or one side of what [`write_pair_features`] writes.
+///
+/// # Errors
+/// Those of [`read_point_features`].
+pub fn read_features_of_side(path: impl AsRef<Path>, side: Side) -> Result<PointFeatures> {
     let path = path.as_ref();
+    let is_pair = NpzFile::open(path)?.names().iter().any(|name| name == "source_points");
+    match (is_pair, side) {
+        (false, _) => read_point_features(path),
+        (true, Side::Source) => read_named_features(path, "source_points", "source_features"),
+        (true, Side::Reference) => {
+            read_named_features(path, "reference_points", "reference_features")
+        }
+    }
+}
+
+fn read_named_features(path: &Path, points_name: &str, name: &str) -> Result<PointFeatures> {
     let mut file = NpzFile::open(path)?;
-    let points = points(path, &mut file, "points")?;
-    let features = file.array_f32("features")?;
+    let points = points(path, &mut file, points_name)?;
+    let features = file.array_f32(name)?;
     let &[rows, dimension @ 1..=usize::MAX] = features.shape.as_slice() else {
-        return Err(shape_error(path, "features", "N x D", &features.shape));
+        return Err(shape_error(path, name, "N x D", &features.shape));
     };
     if rows != points.len() {
-        return Err(count_error(path, "points", points.len(), "features", rows));
+        return Err(count_error(path, points_name, points.len(), name, rows));
     }
-    check_finite(path, "features", &features.values, dimension)?;
+    check_finite(path, name, &features.values, dimension)?;
     PointFeatures::new(points, dimension, features.values)
         .map_err(|error| super::name_file(path, error))
+}
+
+/// What a method says of a pair of clouds.
+#[derive(Debug, Clone, Copy)]
+pub struct PairFeatures<'a> {
+    /// Keypoints of the source with features, in its frame, metres, and a score for each.
+    pub source: (&'a PointFeatures, &'a [f32]),
+    /// The same of the reference.
+    pub reference: (&'a PointFeatures, &'a [f32]),
+    /// Which points belong together.
+    pub correspondences: &'a [Correspondence],
+    /// The transform from source to reference, if the method found one.
+    pub target_from_source: Option<&'a RigidTransform>,
+}
+
+/// Writes what a method says of a pair, an NPZ archive of `source_points`, `source_features`, `source_scores`, the same
+/// of the `reference`, and what [`read_registration_dump`] reads; without a transform, that is missing.
+///
+/// # Errors
+/// Those of [`write_whole`].
+pub fn write_pair_features(path: impl AsRef<Path>, pair: &PairFeatures<'_>) -> Result<()> {
+    let mut entries = Vec::new();
+    for (side, (features, scores)) in [("source", pair.source), ("reference", pair.reference)] {
+        let coordinates = features.points().iter().flat_map(|point| point.coords.as_slice());
+        let shape = [features.len(), features.dimension()];
+        entries.push(Entry::f64(format!("{side}_points"), &[features.len(), 3], coordinates));
+        entries.push(Entry::f32(format!("{side}_features"), &shape, features.values()));
+        entries.push(Entry::f32(format!("{side}_scores"), &[scores.len()], scores));
+    }
+    let pairs = pair.correspondences;
+    let source = pairs.iter().flat_map(|pair| pair.source.coords.as_slice());
+    let target = pairs.iter().flat_map(|pair| pair.target.coords.as_slice());
+    let scores: Vec<f64> = pairs.iter().map(|pair| pair.score).collect();
+    entries.push(Entry::f64("src_corr_points", &[pairs.len(), 3], source));
+    entries.push(Entry::f64("ref_corr_points", &[pairs.len(), 3], target));
+    entries.push(Entry::f64("corr_scores", &[pairs.len()], &scores));
+    if let Some(pose) = pair.target_from_source {
+        let rows = pose.to_matrix().transpose();
+        entries.push(Entry::f64("estimated_transform", &[4, 4], rows.as_slice()));
+    }
+    write_whole(path, |writer| npz::write(writer, &entries))
 }
 
 /// Writes what [`read_point_features`] reads: `points` as 64-bit, `features` as 32-bit floats.
@@ -140,7 +209,8 @@ pub fn read_registration_dump(path: impl AsRef<Path>) -> Result<RegistrationDump
 }
 
 /// Reads correspondences: an NPZ archive of `source` and `reference` (`N x 3`, metres, each in its cloud's frame) and,
-/// if there is one, `score` (`N`, at least 0; 1 where it is missing).
+/// if there is one, `score` (`N`, at least 0; 1 where it is missing). The names of GeoTransformer's `test.py` do as well
+/// (`src_corr_points`, `ref_corr_points`, `corr_scores`).
 ///
 /// # Errors
 /// `Io` if the file cannot be read, `InvalidInput` if an array is missing, has another shape, a number that is not
@@ -148,13 +218,20 @@ pub fn read_registration_dump(path: impl AsRef<Path>) -> Result<RegistrationDump
 pub fn read_correspondences(path: impl AsRef<Path>) -> Result<Vec<Correspondence>> {
     let path = path.as_ref();
     let mut file = NpzFile::open(path)?;
-    let source = points(path, &mut file, "source")?;
-    let target = points(path, &mut file, "reference")?;
+    let names = file.names();
+    let is_dump = names.iter().any(|name| name == "src_corr_points");
+    let [source_name, target_name, score_name] = if is_dump {
+        ["src_corr_points", "ref_corr_points", "corr_scores"]
+    } else {
+        ["source", "reference", "score"]
+    };
+    let source = points(path, &mut file, source_name)?;
+    let target = points(path, &mut file, target_name)?;
     if source.len() != target.len() {
-        return Err(count_error(path, "source", source.len(), "reference", target.len()));
+        return Err(count_error(path, source_name, source.len(), target_name, target.len()));
     }
-    let scores = if file.names().iter().any(|name| name == "score") {
-        scores(path, &file.array_f64("score")?, source.len())?
+    let scores = if names.iter().any(|name| name == score_name) {
+        scores(path, &file.array_f64(score_name)?, source.len())?
     } else {
         vec![1.0; source.len()]
     };

@@ -39,8 +39,9 @@ use std::path::{Path, PathBuf};
 use nalgebra::Point3;
 
 pub use self::features::{
-    RegistrationDump, read_correspondences, read_depth_features, read_point_features,
-    read_registration_dump, write_depth_features, write_point_features,
+    PairFeatures, RegistrationDump, Side, read_correspondences, read_depth_features,
+    read_features_of_side, read_point_features, read_registration_dump, write_depth_features,
+    write_pair_features, write_point_features,
 };
 pub use self::npy::Array;
 pub use self::npz::NpzFile;

@@ -4,15 +4,18 @@ use std::collections::BTreeMap;
 
 use anyhow::{Result, bail};
 use rare::nalgebra::Matrix4;
-use rare::pose::{FastMac, IcpMethod, Mac, MultiScaleIcp, PoseEstimator, Ransac, Sc2Pcr};
+use rare::pose::{IcpMethod, MultiScaleIcp};
 use rare::scale::{Profile, Scale};
 use rare::verify::Verdict;
 use rare::{
-    Correspondence, InitialMethod, PointCloud, Recipe, Refinement, Refiner, RefinerConfig,
-    RigidTransform, Scan,
+    InitialMethod, PointCloud, Recipe, Refinement, Refiner, RefinerConfig, RigidTransform, Scan,
 };
+use rare_nets::networks::{Network, TrainedOn};
 
 use super::start::Start;
+use crate::backbone::open_filter;
+use crate::estimators::Estimator;
+use crate::given_weights::GivenWeights;
 use crate::options::Settings;
 
 /// A method by its name.
@@ -32,15 +35,23 @@ enum Kind {
     Estimate(Estimator, RefinerConfig),
 }
 
-/// An estimator of the paper's tables.
-#[derive(Clone, Copy)]
-enum Estimator {
-    /// With so many samples.
-    Ransac(usize),
-    Sc2Pcr,
-    Sc2PcrPlusPlus,
-    Mac,
-    FastMac,
+/// Where the weights of networks come from that tell right correspondences from wrong ones.
+pub(super) struct Filters<'a> {
+    pub(super) weights: &'a GivenWeights,
+    /// Which weights are meant where several were given; any, if `None`.
+    pub(super) trained_on: Option<TrainedOn>,
+}
+
+impl Filters<'_> {
+    fn open(&self, network: Network, settings: &Settings) -> Result<Estimator> {
+        let option = format!("the method {}", network.name());
+        let fitting = self.trained_on.and_then(|data| self.weights.trained_on(network, data));
+        let file = match fitting {
+            Some(file) => file,
+            None => self.weights.of(network, &option)?,
+        };
+        Ok(Estimator::Filter(open_filter(file, network, settings)?.into()))
+    }
 }
 
 /// What a method made of a pair.
@@ -53,20 +64,25 @@ pub(super) struct Found {
 }
 
 /// All names, for help and errors.
-const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac-50k, ransac-1m, sc2-pcr, sc2-pcr++, mac, fast-mac, refine, refine-paper, refine-no-pca, refine-no-transfer, refine-no-aggregation, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-search, refine-no-verify";
+const NAMES: &str = "init, point-to-point, point-to-plane, symmetric, gicp, vgicp, ransac-50k, ransac-1m, sc2-pcr, sc2-pcr++, mac, fast-mac, pointdsc, vbreg, refine, refine-paper, refine-no-pca, refine-no-transfer, refine-no-aggregation, refine-one-round, refine-no-polish, refine-no-consensus, refine-no-search, refine-no-verify";
 
 impl Method {
     /// Reads a list of names.
     ///
     /// # Errors
     /// If one is unknown or comes twice.
-    pub(super) fn parse_all(names: &[String], settings: &Settings) -> Result<Vec<Method>> {
+    pub(super) fn parse_all(
+        names: &[String],
+        settings: &Settings,
+        filters: &Filters<'_>,
+    ) -> Result<Vec<Method>> {
         let mut methods: Vec<Method> = Vec::new();
         for name in names {
             if methods.iter().any(|method| method.name == *name) {
                 bail!("--methods names {name} twice");
             }
-            methods.push(Method { name: name.clone(), kind: Kind::parse(name, settings)? });
+            methods
+                .push(Method { name: name.clone(), kind: Kind::parse(name, settings, filters)? });
         }
         Ok(methods)
     }
@@ -91,10 +107,9 @@ impl Method {
                 let initial = RigidTransform::from_matrix(initial)?;
                 align(*method, *voxel, source, reference, &initial)
             }
-            Kind::Estimate(estimator, config) => match &start.correspondences {
-                Some(pairs) => estimator.on_pairs(pairs, source, reference, config),
-                None => estimator.on_features(source, reference, config),
-            },
+            Kind::Estimate(estimator, config) => {
+                estimate(estimator, source, reference, start, config)
+            }
             Kind::Refine(config) => Ok(Found::refined(&refine(
                 &Refiner::new(config.clone()),
                 source,
@@ -130,50 +145,36 @@ pub(super) fn refine(
     }
 }
 
-impl Estimator {
-    /// Applies it to given correspondences, with the presets that fit the size of the clouds.
-    fn on_pairs(
-        self,
-        pairs: &[Correspondence],
-        source: &Scan,
-        reference: &Scan,
-        config: &RefinerConfig,
-    ) -> rare::Result<Found> {
-        let (source, reference) = (&source.cloud, &reference.cloud);
-        let voxel = Scale::new(config.profile, config.voxel, source, reference)?.voxel;
-        let estimate = |estimator: &dyn PoseEstimator| estimator.estimate(source, reference, pairs);
-        let estimate = match self {
-            Estimator::Ransac(max_iterations) => {
-                estimate(&Ransac { max_iterations, seed: config.seed, ..Ransac::for_voxel(voxel) })
-            }
-            Estimator::Sc2Pcr => estimate(&Sc2Pcr::for_voxel(voxel)),
-            Estimator::Mac => estimate(&Mac::for_voxel(voxel)),
-            Estimator::FastMac => {
-                estimate(&FastMac { seed: config.seed, ..FastMac::for_voxel(voxel) })
-            }
-            Estimator::Sc2PcrPlusPlus => Err(rare::Error::Unsupported(
-                "sc2-pcr++ needs the descriptors of all keypoints, which came not with the start"
-                    .to_owned(),
-            )),
-        }?;
-        Ok(Found::without_verdict(&estimate.target_from_source))
-    }
-
-    /// Applies it to matches of built-in features.
-    fn on_features(
-        self,
-        source: &Scan,
-        reference: &Scan,
-        config: &RefinerConfig,
-    ) -> rare::Result<Found> {
-        let refiner = Refiner::new(config.clone());
-        if let Estimator::Sc2PcrPlusPlus = self {
-            let method = InitialMethod::Sc2PcrPlusPlus;
-            let pose = refiner.estimate_initial(source, reference, method)?;
-            return Ok(Found::without_verdict(&pose));
+/// Applies an estimator to what a network or official runs found, or else to matches of built-in features.
+fn estimate(
+    estimator: &Estimator,
+    source: &Scan,
+    reference: &Scan,
+    start: &Start,
+    config: &RefinerConfig,
+) -> rare::Result<Found> {
+    let pose = match (&start.correspondences, &start.description) {
+        (Some(pairs), _) => estimator.on_pairs(pairs, source, reference, config),
+        (None, Some(description)) => {
+            estimator.on_description(description, source, reference, config)
         }
-        self.on_pairs(&refiner.initial_matches(source, reference)?, source, reference, config)
+        (None, None) => on_built_in_features(estimator, source, reference, config),
+    }?;
+    Ok(Found::without_verdict(&pose))
+}
+
+fn on_built_in_features(
+    estimator: &Estimator,
+    source: &Scan,
+    reference: &Scan,
+    config: &RefinerConfig,
+) -> rare::Result<RigidTransform> {
+    let refiner = Refiner::new(config.clone());
+    if let Estimator::Sc2PcrPlusPlus = estimator {
+        return refiner.estimate_initial(source, reference, InitialMethod::Sc2PcrPlusPlus);
     }
+    let pairs = refiner.initial_matches(source, reference)?;
+    estimator.on_pairs(&pairs, source, reference, config)
 }
 
 impl Found {
@@ -215,7 +216,7 @@ fn align(
 }
 
 impl Kind {
-    fn parse(name: &str, settings: &Settings) -> Result<Kind> {
+    fn parse(name: &str, settings: &Settings, filters: &Filters<'_>) -> Result<Kind> {
         let given = &settings.refiner;
         let with = |recipe: Recipe| Kind::Refine(RefinerConfig { recipe, ..given.clone() });
         let recipe = given.recipe.clone();
@@ -234,6 +235,8 @@ impl Kind {
             "sc2-pcr++" => estimate(Estimator::Sc2PcrPlusPlus),
             "mac" => estimate(Estimator::Mac),
             "fast-mac" => estimate(Estimator::FastMac),
+            "pointdsc" => estimate(filters.open(Network::PointDsc, settings)?),
+            "vbreg" => estimate(filters.open(Network::Vbreg, settings)?),
             "refine" => with(recipe),
             "refine-paper" => with(Recipe::paper()),
             "refine-no-pca" => with(Recipe { components: None, ..recipe }),

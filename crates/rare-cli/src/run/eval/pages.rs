@@ -77,8 +77,9 @@ impl Page<'_> {
         let Loaded { source, reference } = Loaded::read(self.pair)?;
         let read_seconds = clock.elapsed().as_secs_f64();
         let refiner = Refiner::new(config.clone());
-        let scans = Loaded { source, reference };
-        let refined = scans.start(self.index, plan).and_then(|start| {
+        let mut scans = Loaded { source, reference };
+        let start = scans.start(self.index, plan);
+        let refined = start.and_then(|start| {
             let initial = RigidTransform::from_matrix(&start.pose)?;
             let refinement = refine(&refiner, &scans.source, &scans.reference, &start)?;
             let total_seconds = clock.elapsed().as_secs_f64();
@@ -102,6 +103,7 @@ impl Page<'_> {
             refinement,
             illustration: None,
             network: None,
+            backbone: None,
             read_seconds,
             total_seconds,
         };

@@ -9,6 +9,7 @@ use rare::eval::trajectory;
 use rare::nalgebra::{Matrix4, Point3};
 use rare::pose::{PoseEstimator, Ransac};
 use rare::{Correspondence, InitialMethod, PointCloud};
+use rare_nets::backbones::Description;
 use rare_nets::official;
 use serde::Deserialize;
 use serde::de::IntoDeserializer;
@@ -23,6 +24,8 @@ pub(super) enum Starts {
     Estimated(InitialMethod),
     /// What official runs left of each pair, correspondences and perhaps a transform.
     Dumped(Vec<PathBuf>),
+    /// Made for each pair by the network that describes it.
+    Described,
 }
 
 /// Where the methods start on one pair.
@@ -31,6 +34,8 @@ pub(super) struct Start {
     pub(super) pose: Matrix4<f64>,
     /// Correspondences that came with it, best first.
     pub(super) correspondences: Option<Vec<Correspondence>>,
+    /// What a network said of the pair, which has its features then.
+    pub(super) description: Option<Description>,
 }
 
 impl Starts {
@@ -65,7 +70,7 @@ impl Starts {
 
     /// Whether transforms are all that there is.
     pub(super) fn lack_correspondences(&self) -> bool {
-        !matches!(self, Starts::Dumped(_))
+        !matches!(self, Starts::Dumped(_) | Starts::Described)
     }
 
     /// What results depend on.
@@ -77,6 +82,7 @@ impl Starts {
                 json!({ "given": poses })
             }
             Starts::Estimated(method) => json!({ "estimated": method }),
+            Starts::Described => json!("described"),
             Starts::Dumped(files) => {
                 let files = files.iter().map(|file| file.display().to_string());
                 json!({ "dumped": files.collect::<Vec<_>>() })
@@ -86,6 +92,15 @@ impl Starts {
 }
 
 impl Start {
+    /// A transform alone.
+    pub(super) fn at(pose: Matrix4<f64>) -> Start {
+        Start { pose, correspondences: None, description: None }
+    }
+
+    fn matched(pose: Matrix4<f64>, correspondences: Vec<Correspondence>) -> Start {
+        Start { correspondences: Some(correspondences), ..Start::at(pose) }
+    }
+
     /// Reads a dump and keeps so many of its correspondences, those with the highest scores. Where it has no transform
     /// (CoFiNet, Predator), RANSAC makes one of them, as those networks' own scripts do.
     pub(super) fn read(file: &Path, most: usize, ransac: &Ransac) -> rare::Result<Start> {
@@ -94,12 +109,12 @@ impl Start {
             correspondences.truncate(most);
             let point = PointCloud::new(vec![Point3::origin()])?;
             let pose = ransac.estimate(&point, &point, &correspondences)?.target_from_source;
-            return Ok(Start { pose: pose.to_matrix(), correspondences: Some(correspondences) });
+            return Ok(Start::matched(pose.to_matrix(), correspondences));
         }
         let mut dump = rare::io::read_registration_dump(file)?;
         dump.correspondences.sort_by(|a, b| b.score.total_cmp(&a.score));
         dump.correspondences.truncate(most);
-        Ok(Start { pose: dump.target_from_source, correspondences: Some(dump.correspondences) })
+        Ok(Start::matched(dump.target_from_source, dump.correspondences))
     }
 }
 

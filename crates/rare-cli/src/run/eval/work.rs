@@ -117,7 +117,7 @@ fn finish_pair(index: usize, plan: &Plan, results: &ResultsFolder) -> Result<boo
     let Some(pair) = plan.dataset.pairs.get(index).filter(|_| !left.is_empty()) else {
         return Ok(true);
     };
-    let loaded = Loaded::read(pair)?;
+    let mut loaded = Loaded::read(pair)?;
     let start = loaded.start(index, plan);
     for method in left {
         results.append(&loaded.estimate(index, method, &start))?;
@@ -136,14 +136,26 @@ impl Loaded {
         Ok(Loaded { source: read_scan(&pair.source)?, reference: read_scan(&pair.reference)? })
     }
 
-    /// Where methods start, or why there is nothing to start from.
-    pub(super) fn start(&self, index: usize, plan: &Plan) -> rare::Result<Start> {
+    /// Where methods start, or why there is nothing to start from. Where a network describes the clouds, they have its
+    /// features afterwards.
+    pub(super) fn start(&mut self, index: usize, plan: &Plan) -> rare::Result<Start> {
+        let Some(backbone) = &plan.backbone else { return self.start_of(index, plan) };
+        let description = backbone.describe(&mut self.source, &mut self.reference)?.description;
+        if !matches!(plan.starts, Starts::Described) {
+            let start = self.start_of(index, plan)?;
+            return Ok(Start { description: Some(description), ..start });
+        }
+        let pose = match &description.target_from_source {
+            Ok(pose) => pose.to_matrix(),
+            Err(error) => return Err(rare::Error::no_pose(error.to_string())),
+        };
+        Ok(Start { description: Some(description), ..Start::at(pose) })
+    }
+
+    fn start_of(&self, index: usize, plan: &Plan) -> rare::Result<Start> {
         let missing = || rare::Error::Internal(format!("pair {index} has no start"));
         match &plan.starts {
-            Starts::Given(poses) => {
-                let pose = poses.get(index).copied().ok_or_else(missing)?;
-                Ok(Start { pose, correspondences: None })
-            }
+            Starts::Given(poses) => poses.get(index).copied().map(Start::at).ok_or_else(missing),
             Starts::Dumped(files) => {
                 let (most, ransac) = if plan.dataset.protocol.is_outdoors() {
                     (1000, Ransac::kitti())
@@ -155,8 +167,9 @@ impl Loaded {
             Starts::Estimated(method) => {
                 let refiner = Refiner::new(plan.settings.refiner.clone());
                 let pose = refiner.estimate_initial(&self.source, &self.reference, *method)?;
-                Ok(Start { pose: pose.to_matrix(), correspondences: None })
+                Ok(Start::at(pose.to_matrix()))
             }
+            Starts::Described => Err(missing()),
         }
     }
 

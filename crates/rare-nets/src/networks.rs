@@ -1,0 +1,178 @@
+//! The networks on points by name: which one a weight file is of, and opening it.
+
+use std::fmt;
+use std::path::Path;
+
+use rare::pose::PoseEstimator;
+use rare::{Error, Result};
+use serde::{Deserialize, Serialize};
+
+use crate::backbones::Backbone;
+use crate::checkpoint::{Differences, Layout, Parameters, compare};
+
+/// A network on points.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Network {
+    /// [`crate::backbones::geotransformer`].
+    GeoTransformer,
+    /// [`crate::backbones::predator`].
+    Predator,
+    /// [`crate::backbones::cofinet`].
+    CoFiNet,
+    /// [`crate::backbones::fcgf`].
+    Fcgf,
+    /// [`crate::outliers::pointdsc`].
+    PointDsc,
+    /// [`crate::outliers::vbreg`].
+    Vbreg,
+}
+
+/// What the weights of a network were trained on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TrainedOn {
+    /// Rooms, seen by depth cameras: points 2.5 cm apart.
+    #[serde(rename = "3dmatch")]
+    ThreeDMatch,
+    /// Streets, seen by a rotating scanner: points 30 cm apart.
+    Kitti,
+}
+
+impl Network {
+    /// All of them.
+    pub const ALL: [Network; 6] = [
+        Network::GeoTransformer,
+        Network::Predator,
+        Network::CoFiNet,
+        Network::Fcgf,
+        Network::PointDsc,
+        Network::Vbreg,
+    ];
+
+    /// The name that options and files have for it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Network::GeoTransformer => "geotransformer",
+            Network::Predator => "predator",
+            Network::CoFiNet => "cofinet",
+            Network::Fcgf => "fcgf",
+            Network::PointDsc => "pointdsc",
+            Network::Vbreg => "vbreg",
+        }
+    }
+
+    /// Whether it tells right correspondences from wrong ones, instead of describing clouds.
+    #[must_use]
+    pub fn is_filter(self) -> bool {
+        matches!(self, Network::PointDsc | Network::Vbreg)
+    }
+}
+
+impl fmt::Display for Network {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            Network::GeoTransformer => "GeoTransformer",
+            Network::Predator => "Predator",
+            Network::CoFiNet => "CoFiNet",
+            Network::Fcgf => "FCGF",
+            Network::PointDsc => "PointDSC",
+            Network::Vbreg => "VBReg",
+        })
+    }
+}
+
+impl fmt::Display for TrainedOn {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str(match self {
+            TrainedOn::ThreeDMatch => "3DMatch",
+            TrainedOn::Kitti => "KITTI",
+        })
+    }
+}
+
+/// What a weight file holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Identity {
+    /// The network.
+    pub network: Network,
+    /// What it was trained on, by its sizes and lengths.
+    pub trained_on: TrainedOn,
+    /// Its sizes and lengths in words.
+    pub configuration: String,
+    /// Where the tensors differ from what the network needs.
+    pub differences: Differences,
+}
+
+/// A network with certain sizes, of which a file may be.
+struct Candidate {
+    network: Network,
+    trained_on: TrainedOn,
+    configuration: String,
+    layout: Layout,
+}
+
+/// The least share of a network's names by which a file counts as its weights.
+const LEAST_SHARE: f64 = 0.5;
+
+/// Opens a checkpoint of a network on points: what data-parallel training puts before every name is taken off.
+///
+/// # Errors
+/// Those of [`Parameters::open`].
+pub fn open(path: &Path) -> Result<Parameters> {
+    const PREFIX: &str = "module.";
+    let parameters = Parameters::open(path)?;
+    if !parameters.names().all(|name| name.starts_with(PREFIX)) {
+        return Ok(parameters);
+    }
+    parameters.renamed(|name| name.strip_prefix(PREFIX).map(str::to_owned))
+}
+
+/// Which network the weights are of, by names and shapes alone; `None` if of none that is known.
+#[must_use]
+pub fn identify(parameters: &Parameters) -> Option<Identity> {
+    let share = |candidate: &Candidate| {
+        let found = candidate.layout.keys().filter(|name| parameters.contains(name)).count();
+        found as f64 / candidate.layout.len().max(1) as f64
+    };
+    let (share, best) = candidates(parameters)
+        .into_iter()
+        .map(|candidate| (share(&candidate), candidate))
+        .max_by(|(a, _), (b, _)| a.total_cmp(b))?;
+    (share >= LEAST_SHARE).then(|| Identity {
+        network: best.network,
+        trained_on: best.trained_on,
+        configuration: best.configuration,
+        differences: compare(&best.layout, parameters),
+    })
+}
+
+/// Every network, with the sizes that the weights would have if they were of it.
+fn candidates(_parameters: &Parameters) -> Vec<Candidate> {
+    Vec::new()
+}
+
+/// Reads all weights of a network once.
+///
+/// # Errors
+/// If some are missing, of another shape, or not finite.
+pub fn check(identity: &Identity, parameters: &Parameters) -> Result<()> {
+    if identity.network.is_filter() {
+        open_filter(identity.network, parameters, 0).map(|_| ())
+    } else {
+        Backbone::load(identity.network, parameters).map(|_| ())
+    }
+}
+
+/// Opens a network that tells right correspondences from wrong ones; `seed` is that of its random choices.
+///
+/// # Errors
+/// If the weights are of another network, or damaged; `Internal` if the network is none of this kind.
+pub fn open_filter(
+    network: Network,
+    _parameters: &Parameters,
+    _seed: u64,
+) -> Result<Box<dyn PoseEstimator>> {
+    Err(Error::Internal(format!("{network} filters no correspondences")))
+}
