@@ -9,7 +9,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use anyhow::Result;
-use rare_nets::weights::{self, Choice, SOURCES, Source};
+use rare_nets::weights::{self, Choice, PUBLISHED, SOURCES, Source};
 
 use crate::SUCCESS;
 use crate::args::{CheckArgs, WeightsArgs, WeightsCommand};
@@ -26,14 +26,40 @@ pub(super) fn run(args: WeightsArgs) -> Result<u8> {
 }
 
 fn list() -> Result<u8> {
-    let sources: Vec<String> = SOURCES.iter().map(describe).collect();
-    print(&sources.join("\n"))?;
+    let mut parts = vec!["Diffusion features, which `rare weights fetch` gets:\n".to_owned()];
+    parts.extend(SOURCES.iter().map(describe));
+    parts.push(describe_published());
+    print(&parts.join("\n"))?;
     if SOURCES.iter().any(|source| source.files.iter().any(|file| !file.is_verified())) {
         summary::say(
             "unverified: neither length nor hash is known beforehand; a download is compared with what the server announces",
         );
     }
     Ok(SUCCESS)
+}
+
+/// The checkpoints of the networks on points, a line for each.
+fn describe_published() -> String {
+    let mut text = String::from(
+        "Networks on points, whose checkpoints a person must download; `rare weights check FILE` says what one is:\n",
+    );
+    let mut place = "";
+    for file in &PUBLISHED {
+        if file.place != place {
+            place = file.place;
+            writeln!(text, "\n{}: {place}", file.network).unwrap_or_default();
+        }
+        let bytes = file.bytes.map_or_else(|| "unknown".to_owned(), |bytes| bytes.to_string());
+        let (trained_on, remark) = (file.trained_on.to_string(), file.remark);
+        let sha256 = file.sha256.unwrap_or("unknown");
+        writeln!(
+            text,
+            "  {trained_on:<8} {:<48} {remark}; bytes {bytes}, SHA-256 {sha256}",
+            file.file
+        )
+        .unwrap_or_default();
+    }
+    text
 }
 
 /// A repository and its files, a line for each.

@@ -1,5 +1,7 @@
 //! Where the weights of the networks come from, and whether what lies in a folder is what was published.
 //!
+//! [`PUBLISHED`] names the checkpoints of the networks on points, which a person downloads.
+//!
 //! [`SOURCES`] names the repositories and files. `fetch` (cargo feature `fetch`) makes a pipeline folder of them and
 //! writes beside them a [`Lock`]: what each file is, by content. [`check`] compares a folder with its lock later, without
 //! the internet, and [`open`] its tensors with what the networks need.
@@ -13,9 +15,11 @@ mod digest;
 pub mod fetch;
 mod hub;
 mod lock;
+mod published;
 mod sources;
 
 pub use check::{Checked, check, open};
 pub use hub::{Hub, Token};
 pub use lock::{LOCK_FILE, Lock, LockedFile};
+pub use published::{PUBLISHED, Published};
 pub use sources::{Choice, ControlNetVersion, Precision, SOURCES, Source, SourceFile};
