@@ -7,6 +7,9 @@
 //!
 //! | module | network | pose of its own |
 //! |---|---|---|
+//! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
+
+pub mod fcgf;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
