@@ -7,6 +7,9 @@
 //!
 //! | module | network | pose of its own |
 //! |---|---|---|
+//! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
+
+pub mod fcgf;
 
 use crate::checkpoint::Parameters;
 use crate::networks::{Network, TrainedOn};

@@ -1,0 +1,91 @@
+//! What differs between the published models.
+
+use rare::pose::{Mode, Ransac};
+
+use crate::checkpoint::Parameters;
+
+/// The settings of a model and of what is made of its features.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Config {
+    /// Edge of a voxel, metres. It is not in the weights: it must be that of the training.
+    pub voxel: f64,
+    /// Offsets along an edge of the first kernel, odd. [`Config::fitted`] takes it from the weights.
+    pub first_kernel: usize,
+    /// Length of a feature. [`Config::fitted`] takes it from the weights.
+    pub features: usize,
+    /// Whether features are divided by their norm.
+    pub unit_features: bool,
+    /// Which features belong together.
+    pub matching: Matching,
+    /// What finds the pose.
+    pub ransac: Ransac,
+}
+
+/// Which keypoints are matched.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Matching {
+    /// Each source keypoint with the nearest target feature.
+    Nearest,
+    /// Those that are each other's nearest.
+    Mutual,
+}
+
+/// What the authors' scripts search at most.
+const ITERATIONS: usize = 4_000_000;
+
+impl Config {
+    /// Rooms at 2.5 cm, features of 32 numbers.
+    #[must_use]
+    pub fn three_d_match() -> Config {
+        let voxel = 0.025;
+        Config {
+            voxel,
+            first_kernel: 7,
+            features: 32,
+            unit_features: true,
+            matching: Matching::Nearest,
+            ransac: ransac(1.5 * voxel),
+        }
+    }
+
+    /// Rooms at 5 cm.
+    #[must_use]
+    pub fn three_d_match_coarse() -> Config {
+        let voxel = 0.05;
+        Config { voxel, ransac: ransac(1.5 * voxel), ..Config::three_d_match() }
+    }
+
+    /// Streets at 30 cm.
+    #[must_use]
+    pub fn kitti() -> Config {
+        let voxel = 0.3;
+        Config { voxel, first_kernel: 5, ransac: ransac(voxel), ..Config::three_d_match() }
+    }
+
+    /// With the size of the first kernel and the length of features that the weights have; unchanged where they have no
+    /// such tensors.
+    #[must_use]
+    pub fn fitted(mut self, parameters: &Parameters) -> Config {
+        if let Some([offsets, ..]) = parameters.shape("conv1.kernel") {
+            let side = (1..=*offsets).take_while(|side| side * side * side <= *offsets).last();
+            self.first_kernel = side.unwrap_or(self.first_kernel);
+        }
+        if let Some([.., features]) = parameters.shape("final.kernel") {
+            self.features = *features;
+        }
+        self
+    }
+}
+
+/// Four points, edges that agree to a tenth, residuals within `threshold` metres.
+fn ransac(threshold: f64) -> Ransac {
+    Ransac {
+        inlier_threshold: threshold,
+        sample_size: 4,
+        max_iterations: ITERATIONS,
+        edge_ratio: 0.9,
+        check_residuals: true,
+        mode: Mode::Fixed,
+        ..Ransac::three_d_match()
+    }
+}

@@ -1,0 +1,5 @@
+//! Networks on points against recorded stages of other implementations.
+
+mod fcgf;
+mod formula;
+mod full_width;
