@@ -7,7 +7,7 @@ use rare::pose::PoseEstimator;
 use rare::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-use crate::backbones::Backbone;
+use crate::backbones::{Backbone, fcgf};
 use crate::checkpoint::{Differences, Layout, Parameters, compare};
 
 /// A network on points.
@@ -67,6 +67,13 @@ impl Network {
     #[must_use]
     pub fn is_filter(self) -> bool {
         matches!(self, Network::PointDsc | Network::Vbreg)
+    }
+}
+
+impl TrainedOn {
+    /// By the spacing of the points, metres.
+    pub(crate) fn from_voxel(voxel: f64) -> TrainedOn {
+        if voxel > 0.1 { TrainedOn::Kitti } else { TrainedOn::ThreeDMatch }
     }
 }
 
@@ -149,8 +156,22 @@ pub fn identify(parameters: &Parameters) -> Option<Identity> {
 }
 
 /// Every network, with the sizes that the weights would have if they were of it.
-fn candidates(_parameters: &Parameters) -> Vec<Candidate> {
-    Vec::new()
+fn candidates(parameters: &Parameters) -> Vec<Candidate> {
+    vec![fcgf_candidate(parameters)]
+}
+
+fn fcgf_candidate(parameters: &Parameters) -> Candidate {
+    let config = fcgf::Config::of(parameters);
+    let unit = if config.unit_features { "of unit length" } else { "of any length" };
+    Candidate {
+        network: Network::Fcgf,
+        trained_on: TrainedOn::from_voxel(config.voxel),
+        configuration: format!(
+            "voxels of {} m, first kernel {1} x {1} x {1}, {2} features {unit}",
+            config.voxel, config.first_kernel, config.features
+        ),
+        layout: fcgf::layout_as_stored(&config, parameters),
+    }
 }
 
 /// Reads all weights of a network once.

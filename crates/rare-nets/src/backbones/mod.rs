@@ -9,10 +9,11 @@
 //! |---|---|---|
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
 
+mod backbone;
 pub mod fcgf;
 
-use crate::checkpoint::Parameters;
-use crate::networks::{Network, TrainedOn};
+pub use backbone::Backbone;
+
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
 use serde::{Deserialize, Serialize};
@@ -81,42 +82,6 @@ pub enum SelectionRule {
 impl Default for Selection {
     fn default() -> Selection {
         Selection { count: 500, rule: SelectionRule::TopScore, seed: 0 }
-    }
-}
-
-/// A network with its weights.
-pub struct Backbone {
-    network: Network,
-    trained_on: TrainedOn,
-}
-
-impl Backbone {
-    /// Loads a network.
-    ///
-    /// # Errors
-    /// If the weights are of another network, or damaged; `Internal` if the network is none of this kind.
-    pub fn load(network: Network, _parameters: &Parameters) -> Result<Backbone> {
-        Err(rare::Error::Internal(format!("{network} describes no clouds")))
-    }
-
-    /// What the weights were trained on.
-    #[must_use]
-    pub fn trained_on(&self) -> TrainedOn {
-        self.trained_on
-    }
-
-    /// Finds keypoints, features, correspondences and a pose of two clouds.
-    ///
-    /// # Errors
-    /// `InvalidInput` if the clouds have too few points, would need more memory than there is, or the limits do not
-    /// fit.
-    pub fn describe(
-        &self,
-        _source: &PointCloud,
-        _target: &PointCloud,
-        _request: &Request,
-    ) -> Result<Description> {
-        Err(rare::Error::Internal(format!("{} describes no clouds", self.network)))
     }
 }
 

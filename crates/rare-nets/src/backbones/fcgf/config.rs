@@ -62,6 +62,30 @@ impl Config {
         Config { voxel, first_kernel: 5, ransac: ransac(voxel), ..Config::three_d_match() }
     }
 
+    /// The published model that the weights are of: by the settings of their training, which the authors' files hold, or
+    /// else by the size of the first kernel.
+    #[must_use]
+    pub fn of(parameters: &Parameters) -> Config {
+        let setting = |name: &str| parameters.metadata().get(name).map(String::as_str);
+        let voxel = setting("config.voxel_size").and_then(|text| text.parse::<f64>().ok());
+        let voxel = voxel.filter(|voxel| *voxel > 0.0 && voxel.is_finite());
+        let is_outdoors = match voxel {
+            Some(voxel) => voxel > 0.1,
+            None => {
+                parameters.shape("conv1.kernel").is_some_and(|shape| shape.first() == Some(&125))
+            }
+        };
+        let config = if is_outdoors { Config::kitti() } else { Config::three_d_match() };
+        let unit_features = match setting("config.normalize_feature") {
+            Some("false") => false,
+            Some("true") => true,
+            _ => config.unit_features,
+        };
+        let voxel = voxel.unwrap_or(config.voxel);
+        let threshold = config.ransac.inlier_threshold * voxel / config.voxel;
+        Config { voxel, unit_features, ransac: ransac(threshold), ..config }.fitted(parameters)
+    }
+
     /// With the size of the first kernel and the length of features that the weights have; unchanged where they have no
     /// such tensors.
     #[must_use]

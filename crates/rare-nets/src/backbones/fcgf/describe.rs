@@ -38,6 +38,7 @@ impl Fcgf {
             target,
             correspondences,
             target_from_source,
+            neighbour_limits: None,
             warnings: Vec::new(),
         })
     }

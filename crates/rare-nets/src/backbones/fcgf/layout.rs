@@ -1,7 +1,7 @@
 //! The tensors of `ResUNetBN2C`.
 
 use super::Config;
-use crate::checkpoint::Layout;
+use crate::checkpoint::{Layout, Parameters};
 
 /// Channels of the four strides on the way down.
 pub(super) const DOWN: [usize; 4] = [32, 64, 128, 256];
@@ -10,7 +10,7 @@ pub(super) const UP: [usize; 3] = [64, 64, 128];
 /// Channels before the last layer.
 pub(super) const LAST: usize = 64;
 /// The kernels with one offset: older files write `1 x inputs x outputs`, newer ones `inputs x outputs`.
-pub(super) const POINTWISE: [&str; 2] = ["conv1_tr.kernel", "final.kernel"];
+const POINTWISE: [&str; 2] = ["conv1_tr.kernel", "final.kernel"];
 
 /// The shape of every tensor of a model, kernels as `offsets x inputs x outputs`, as current files write them.
 #[must_use]
@@ -29,6 +29,20 @@ pub fn layout(config: &Config) -> Layout {
     layout.insert("conv1_tr.kernel".to_owned(), vec![UP[0] + DOWN[0], LAST]);
     layout.insert("final.kernel".to_owned(), vec![LAST, config.features]);
     layout.insert("final.bias".to_owned(), vec![1, config.features]);
+    layout
+}
+
+/// The same with kernels of one offset as the weights have them.
+#[must_use]
+pub fn layout_as_stored(config: &Config, parameters: &Parameters) -> Layout {
+    let mut layout = layout(config);
+    for name in POINTWISE {
+        if let (Some([1, rest @ ..]), Some(shape)) = (parameters.shape(name), layout.get_mut(name))
+            && rest == shape.as_slice()
+        {
+            shape.insert(0, 1);
+        }
+    }
     layout
 }
 

@@ -20,5 +20,5 @@ mod network;
 mod voxels;
 
 pub use config::{Config, Matching};
-pub use layout::layout;
+pub use layout::{layout, layout_as_stored};
 pub use network::{Fcgf, Output};

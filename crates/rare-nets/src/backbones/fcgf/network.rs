@@ -7,7 +7,7 @@ use super::Config;
 use super::convolution::{FirstConvolution, SparseConvolution};
 use super::coordinates::{Coordinate, CoordinateMap};
 use super::kernel_map::KernelMap;
-use super::layout::{POINTWISE, layout};
+use super::layout::layout_as_stored;
 use super::voxels::voxelise;
 use crate::Matrix;
 use crate::checkpoint::Parameters;
@@ -62,15 +62,7 @@ impl Fcgf {
     /// `InvalidInput` if they are not the weights of this network or are damaged; `Io`, `Unsupported` as the file has it.
     pub fn load(parameters: &Parameters, config: Config) -> Result<Fcgf> {
         let config = config.fitted(parameters);
-        let mut layout = layout(&config);
-        for name in POINTWISE {
-            if let (Some([1, rest @ ..]), Some(shape)) =
-                (parameters.shape(name), layout.get_mut(name))
-                && rest == shape.as_slice()
-            {
-                shape.insert(0, 1);
-            }
-        }
+        let layout = layout_as_stored(&config, parameters);
         let weights = Weights::new(parameters, &layout, "FCGF")?;
         let cpu = CpuBackend::new(Precision::F32)?;
         Ok(Fcgf {
