@@ -8,6 +8,9 @@
 //! | module | network | pose of its own |
 //! |---|---|---|
 
+pub mod geotransformer;
+pub mod kpconv;
+
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
 use serde::{Deserialize, Serialize};

@@ -1,0 +1,4 @@
+//! Networks on points against what their released code computes.
+
+mod geotransformer;
+mod kpconv;
