@@ -14,6 +14,9 @@ pub mod fcgf;
 
 pub use backbone::Backbone;
 
+pub mod geotransformer;
+pub mod kpconv;
+
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
 use serde::{Deserialize, Serialize};

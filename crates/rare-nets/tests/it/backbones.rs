@@ -3,3 +3,5 @@
 mod fcgf;
 mod formula;
 mod full_width;
+mod geotransformer;
+mod kpconv;
