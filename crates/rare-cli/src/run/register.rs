@@ -134,7 +134,7 @@ impl Problem {
             (None, _, Some(description)) => match &description.target_from_source {
                 Ok(pose) => Ok(*pose),
                 Err(error) => Err(rare::Error::no_pose(format!(
-                    "the network found no transform ({error}): another --init-method may"
+                    "the network found no transform ({error}): try another estimator on its correspondences, --init-method sc2-pcr"
                 ))),
             },
             (None, _, None) => Err(rare::Error::Internal("no initial transform".to_owned())),

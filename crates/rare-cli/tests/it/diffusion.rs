@@ -3,30 +3,16 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::shared::{Outcome, Workplace, argument, keys};
-
-/// The file or folder `relative` of the shared data, or `None` (with a printed line) where there is none.
-fn shared(relative: &str) -> Option<PathBuf> {
-    let root = std::env::var_os("RARE_SHARED")
-        .map(PathBuf::from)
-        .unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"));
-    let path = root.join(relative);
-    let required = std::env::var("RARE_REQUIRE_SHARED").as_deref() == Ok("1");
-    assert!(path.exists() || !required, "there is no {}", path.display());
-    if !path.exists() {
-        println!("skipped: no {}", path.display());
-    }
-    path.canonicalize().ok()
-}
+use crate::shared::{Outcome, Workplace, argument, keys, shared_path};
 
 fn pipeline() -> Option<PathBuf> {
-    shared("golden/rare/tiny-pipeline")
+    shared_path("golden/rare/tiny-pipeline")
 }
 
 /// A real pair in a folder, with a start near the truth, and the pipeline.
 fn real_pair() -> Option<(Workplace, PathBuf)> {
     let pipeline = pipeline()?;
-    let folder = shared("data/redkitchen-dev/frag50")?;
+    let folder = shared_path("data/redkitchen-dev/frag50")?;
     let workplace = Workplace::empty();
     let text = std::fs::read_to_string(folder.join("init_pert_easy.json")).unwrap();
     let starts: serde_json::Value = serde_json::from_str(&text).unwrap();

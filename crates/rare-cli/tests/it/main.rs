@@ -1,6 +1,7 @@
 //! The program as its users see it: files in, files, exit codes and messages out.
 #![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking")]
 
+mod backbones;
 mod bad_input;
 #[path = "../../../rare/examples/synthetic_benchmark/benchmark.rs"]
 mod benchmark;

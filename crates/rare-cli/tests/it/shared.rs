@@ -100,6 +100,14 @@ impl Workplace {
 }
 
 impl Outcome {
+    /// No pose, for a reason that contains the words, in one line.
+    pub(crate) fn assert_refused_pose(&self, words: &[&str]) {
+        assert_eq!(self.code, 1, "{self:?}");
+        for word in words {
+            assert!(self.stderr.contains(word), "{word} is missing in {self:?}");
+        }
+    }
+
     /// The transform on stdout.
     pub(crate) fn pose(&self) -> RigidTransform {
         let rows: Vec<Vec<f64>> = self
@@ -231,4 +239,18 @@ pub(crate) fn added(before: &[String], after: &[String]) -> Vec<String> {
 /// A path as an argument.
 pub(crate) fn argument(path: &Path) -> &str {
     path.to_str().unwrap()
+}
+
+/// The file or folder `relative` of the shared data, or `None` (with a printed line) where there is none.
+pub(crate) fn shared_path(relative: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("RARE_SHARED")
+        .map(PathBuf::from)
+        .unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"));
+    let path = root.join(relative);
+    let required = std::env::var("RARE_REQUIRE_SHARED").as_deref() == Ok("1");
+    assert!(path.exists() || !required, "there is no {}", path.display());
+    if !path.exists() {
+        println!("skipped: no {}", path.display());
+    }
+    path.canonicalize().ok()
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use rare::Result;
 
 use super::super::ElementType;
+use super::harm;
 use super::machine::Machine;
 use super::node::{Array, Id, Instance, Node, NumberType, Storage, Strided};
 
@@ -25,6 +26,9 @@ impl Machine<'_, '_> {
         };
         match self.known(&class, &given)? {
             Some(id) => Ok(id),
+            None if harm::runs_code(&class) => Err(self.input.fault(format!(
+                "calls {class}, which runs code: it was not called, but this is no file of weights to trust"
+            ))),
             None => Ok(self.instance(class, arguments)),
         }
     }

@@ -12,6 +12,7 @@
 mod archive;
 mod build;
 mod finish;
+mod harm;
 mod input;
 mod machine;
 mod node;

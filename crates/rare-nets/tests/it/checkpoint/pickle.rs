@@ -93,11 +93,17 @@ fn point_clouds_of_numpy_and_torch_read_exactly() {
 }
 
 #[test]
-fn nothing_is_called() {
+fn nothing_is_called_and_what_would_run_code_is_refused_by_name() {
     // os.system("true"), which Python would run.
-    let object = opened(b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.").unwrap();
+    let refused = opened(b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.").unwrap_err();
+    let message = refused.to_string();
+    assert!(message.contains("os.system") && message.contains("not called"), "{message}");
+    let refused = opened(b"\x80\x02c__builtin__\neval\nX\x01\x00\x00\x001\x85R.").unwrap_err();
+    assert!(refused.to_string().contains("__builtin__.eval"), "{refused}");
+    // A class that means nothing here is data.
+    let object = opened(b"\x80\x02ceasydict\nEasyDict\nX\x04\x00\x00\x00true\x85R.").unwrap();
     let Object::Instance(instance) = object else { panic!("{object:?}") };
-    assert_eq!(&*instance.class, "os.system");
+    assert_eq!(&*instance.class, "easydict.EasyDict");
     assert_eq!(instance.arguments.items()[0].text(), Some("true"));
 }
 
