@@ -7,9 +7,12 @@
 //!
 //! | module | network | pose of its own |
 //! |---|---|---|
+//! | [`cofinet`] | CoFiNet (Yu et al.: NeurIPS 2021) | RANSAC |
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
 
+pub mod cofinet;
 pub mod fcgf;
+mod hourglass;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
