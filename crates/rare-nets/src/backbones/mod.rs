@@ -9,10 +9,14 @@
 //! |---|---|---|
 //! | [`cofinet`] | CoFiNet (Yu et al.: NeurIPS 2021) | RANSAC |
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
+//! | [`predator`] | Predator (Huang et al.: CVPR 2021) | RANSAC |
 
 pub mod cofinet;
 pub mod fcgf;
+pub mod geotransformer;
 mod hourglass;
+pub mod kpconv;
+pub mod predator;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};

@@ -1,6 +1,6 @@
 //! Which coarse points belong together.
 
-use super::Config;
+use super::CoFiNetConfig;
 use crate::Matrix;
 
 /// A coarse point of either cloud and how sure it is that they belong together, 0 to 1.
@@ -26,7 +26,7 @@ pub(super) struct Kept {
 /// The pairs whose confidence is above a threshold, which is lowered until there are enough of them.
 ///
 /// At a threshold below 0 all pairs count, however few there are: two small clouds have no more.
-pub(super) fn coarse_pairs(confidences: &Matrix, config: &Config) -> Kept {
+pub(super) fn coarse_pairs(confidences: &Matrix, config: &CoFiNetConfig) -> Kept {
     let enough = |threshold: f64| {
         let above = |value: &&f32| f64::from(**value) > threshold;
         confidences.values().iter().filter(above).count() >= config.fewest_pairs
@@ -63,7 +63,8 @@ mod tests {
     fn the_threshold_falls_until_there_are_enough() {
         let confidences = Matrix::new(2, 2, vec![0.5, 0.1, 0.15, 0.3]).unwrap();
         let with = |fewest_pairs, most_pairs| {
-            let config = Config { fewest_pairs, most_pairs, ..Config::three_d_match() };
+            let config =
+                CoFiNetConfig { fewest_pairs, most_pairs, ..CoFiNetConfig::three_d_match() };
             let kept = coarse_pairs(&confidences, &config);
             (
                 kept.pairs.iter().map(|pair| [pair.source, pair.target]).collect::<Vec<_>>(),
@@ -79,7 +80,7 @@ mod tests {
     #[test]
     fn what_is_no_number_belongs_to_nothing_and_nothing_runs_for_ever() {
         let confidences = Matrix::new(1, 2, vec![f32::NAN, 0.0]).unwrap();
-        let config = Config { threshold_step: 0.0, ..Config::three_d_match() };
+        let config = CoFiNetConfig { threshold_step: 0.0, ..CoFiNetConfig::three_d_match() };
         assert_eq!(coarse_pairs(&confidences, &config).pairs.len(), 1);
     }
 }

@@ -7,7 +7,9 @@ use crate::backbones::kpconv::PyramidConfig;
 
 /// The settings of a model and of what is made of its features.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Config {
+pub struct CoFiNetConfig {
+    /// What it was trained on, for messages.
+    pub name: &'static str,
     /// Stages of points and the reach of the convolutions.
     pub pyramid: PyramidConfig,
     /// Channels of the first stage.
@@ -35,11 +37,12 @@ pub struct Config {
     pub ransac: Ransac,
 }
 
-impl Config {
+impl CoFiNetConfig {
     /// Rooms at 2.5 cm.
     #[must_use]
-    pub fn three_d_match() -> Config {
-        Config {
+    pub fn three_d_match() -> CoFiNetConfig {
+        CoFiNetConfig {
+            name: "3DMatch",
             pyramid: PyramidConfig { voxel: 0.025, stages: 4, radius: 2.5, sigma: 2.0 },
             width: 128,
             coarse_channels: 256,
@@ -61,9 +64,10 @@ impl Config {
 
     /// Streets at 30 cm.
     #[must_use]
-    pub fn kitti() -> Config {
-        let rooms = Config::three_d_match();
-        Config {
+    pub fn kitti() -> CoFiNetConfig {
+        let rooms = CoFiNetConfig::three_d_match();
+        CoFiNetConfig {
+            name: "KITTI",
             pyramid: PyramidConfig { voxel: 0.3, stages: 4, radius: 4.25, sigma: 2.0 },
             threshold_step: 0.01,
             patch: 32,

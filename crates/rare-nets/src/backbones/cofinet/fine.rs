@@ -3,7 +3,7 @@
 use rare::Result;
 use rayon::prelude::*;
 
-use super::Config;
+use super::CoFiNetConfig;
 use super::coarse::CoarsePair;
 use super::layout::FINE;
 use super::patches::Patches;
@@ -53,7 +53,7 @@ impl FineMatching {
     pub(super) fn read(
         cpu: &CpuBackend,
         weights: &Weights<'_>,
-        config: &Config,
+        config: &CoFiNetConfig,
     ) -> Result<FineMatching> {
         let [first, second, third] = FINE;
         let attention = |name| MessagePassing::read(cpu, weights, name, config.heads);

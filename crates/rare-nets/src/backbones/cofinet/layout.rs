@@ -1,6 +1,6 @@
 //! The tensors of `CoFiNet`.
 
-use super::Config;
+use super::CoFiNetConfig;
 use crate::backbones::hourglass::{MessagePassing, pointwise};
 use crate::checkpoint::Layout;
 
@@ -11,7 +11,7 @@ pub(super) const FINE: [&str; 3] = ["l_sattn1", "l_cattn", "l_sattn2"];
 
 /// The shape of every tensor of a model. `l_bin_score` and `encoder.epsilon` are there, but nothing uses them.
 #[must_use]
-pub fn layout(config: &Config) -> Layout {
+pub fn layout(config: &CoFiNetConfig) -> Layout {
     let mut layout = Layout::new();
     for scalar in ["bin_score", "l_bin_score", "encoder.epsilon"] {
         layout.insert(scalar.to_owned(), Vec::new());

@@ -19,7 +19,7 @@ mod sinkhorn;
 mod transport;
 
 pub use coarse::CoarsePair;
-pub use config::Config;
+pub use config::CoFiNetConfig;
 pub use fine::FinePair;
 pub use layout::layout;
 pub use network::{CoFiNet, Output};

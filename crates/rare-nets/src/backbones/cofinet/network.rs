@@ -2,14 +2,14 @@
 
 use rare::{Error, Result};
 
-use super::Config;
+use super::CoFiNetConfig;
 use super::coarse::{CoarsePair, coarse_pairs};
 use super::fine::{FineMatching, FinePair, Sides};
 use super::layout::{COARSE, layout};
 use super::patches::Patches;
 use super::transport::optimal_transport;
 use crate::Matrix;
-use crate::backbones::hourglass::{Decoder, Encoder, MessagePassing, Turns};
+use crate::backbones::hourglass::{Decoder, Encoder, MessagePassing, Turns, halves};
 use crate::backbones::kpconv::Pyramid;
 use crate::checkpoint::Parameters;
 use crate::engine::{CpuBackend, Precision};
@@ -17,7 +17,7 @@ use crate::layers::{Linear, Weights, products};
 
 /// The network with its weights (Yu et al.: `CoFiNet`, NeurIPS 2021).
 pub struct CoFiNet {
-    pub(super) config: Config,
+    pub(super) config: CoFiNetConfig,
     cpu: CpuBackend,
     encoder: Encoder,
     bottleneck: Linear,
@@ -46,7 +46,7 @@ pub struct Output {
     pub coarse_confidences: Matrix,
     /// The coarse points that belong together.
     pub coarse_pairs: Vec<CoarsePair>,
-    /// How many of them there would be without `Config::most_pairs`.
+    /// How many of them there would be without `CoFiNetConfig::most_pairs`.
     pub coarse_pairs_found: usize,
     /// The fine points around each coarse one.
     pub patches: [Patches; 2],
@@ -61,9 +61,10 @@ impl CoFiNet {
     ///
     /// # Errors
     /// `InvalidInput` if they are not the weights of this network or are damaged; `Io`, `Unsupported` as the file has it.
-    pub fn load(parameters: &Parameters, config: Config) -> Result<CoFiNet> {
+    pub fn load(parameters: &Parameters, config: CoFiNetConfig) -> Result<CoFiNet> {
         let layout = layout(&config);
-        let weights = Weights::new(parameters, &layout, "CoFiNet")?;
+        let network = format!("CoFiNet for {}", config.name);
+        let weights = Weights::new(parameters, &layout, &network)?;
         let cpu = CpuBackend::new(Precision::F32)?;
         let attention = |name| MessagePassing::read(&cpu, &weights, name, config.heads);
         let [first, second, third] = COARSE;
@@ -135,11 +136,6 @@ impl CoFiNet {
         scores.values_mut().iter_mut().for_each(|score| *score *= factor);
         optimal_transport(&scores, self.bin, self.config.iterations)
     }
-}
-
-/// The rows of either cloud.
-fn halves(stacked: &Matrix, [first, second]: [usize; 2]) -> [Matrix; 2] {
-    [stacked.part(0, first), stacked.part(first, second)]
 }
 
 /// The patches of both clouds.

@@ -1,6 +1,6 @@
 //! The tensors of `ResUNetBN2C`.
 
-use super::Config;
+use super::FcgfConfig;
 use crate::checkpoint::Layout;
 
 /// Channels of the four strides on the way down.
@@ -14,7 +14,7 @@ pub(super) const POINTWISE: [&str; 2] = ["conv1_tr.kernel", "final.kernel"];
 
 /// The shape of every tensor of a model, kernels as `offsets x inputs x outputs`, as current files write them.
 #[must_use]
-pub fn layout(config: &Config) -> Layout {
+pub fn layout(config: &FcgfConfig) -> Layout {
     let mut layout = Layout::new();
     let offsets = config.first_kernel.saturating_pow(3);
     layout.insert("conv1.kernel".to_owned(), vec![offsets, 1, DOWN[0]]);

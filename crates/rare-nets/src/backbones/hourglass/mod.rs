@@ -11,6 +11,13 @@ mod decoder;
 mod encoder;
 mod message_passing;
 
+use crate::Matrix;
+
 pub(super) use decoder::{Decoder, DecoderSizes};
 pub(super) use encoder::{Encoded, Encoder, EncoderSizes};
 pub(super) use message_passing::{MessagePassing, Turns, pointwise};
+
+/// The rows of either cloud.
+pub(super) fn halves(stacked: &Matrix, [first, second]: [usize; 2]) -> [Matrix; 2] {
+    [stacked.part(0, first), stacked.part(first, second)]
+}

@@ -1,16 +1,16 @@
 //! `CoFiNet` against recorded stages of the official code.
 
 use rare_nets::Matrix;
-use rare_nets::backbones::cofinet::{CoFiNet, Config, Output, layout};
+use rare_nets::backbones::cofinet::{CoFiNet, CoFiNetConfig, Output, layout};
 use rare_nets::backbones::kpconv::PyramidConfig;
 
 use super::formula::official_layout;
-use super::recorded::{TOLERANCE, compare, pyramid, weights};
+use super::recorded::{TOLERANCE, compare, compare_change, pyramid, weights};
 use crate::shared::{GoldenTensors, relative_difference};
 
-fn tiny() -> Config {
-    let rooms = Config::three_d_match();
-    Config {
+fn tiny() -> CoFiNetConfig {
+    let rooms = CoFiNetConfig::three_d_match();
+    CoFiNetConfig {
         pyramid: PyramidConfig { voxel: 0.1, ..rooms.pyramid },
         width: 32,
         coarse_channels: 64,
@@ -33,11 +33,6 @@ fn part(matrix: &Matrix, first: usize, rows: usize) -> Matrix {
     Matrix::new(rows, matrix.columns(), values).unwrap()
 }
 
-fn difference(after: &Matrix, before: &Matrix) -> Matrix {
-    let values = after.values().iter().zip(before.values()).map(|(a, b)| a - b).collect();
-    Matrix::new(after.rows(), after.columns(), values).unwrap()
-}
-
 #[test]
 fn features_of_every_stage_are_the_official_ones() {
     let Some((golden, output)) = recorded() else { return };
@@ -50,8 +45,8 @@ fn features_of_every_stage_are_the_official_ones() {
     let before = [part(&output.bottleneck, 0, source), part(&output.bottleneck, source, target)];
     let steps = [&before].into_iter().chain(&output.attended);
     for ((before, after), name) in steps.zip(&output.attended).zip(["sattn1", "cattn", "sattn2"]) {
-        compare(&golden, name, &difference(&after[0], &before[0]));
-        compare(&golden, &format!("{name}#call2"), &difference(&after[1], &before[1]));
+        compare_change(&golden, name, &after[0], &before[0]);
+        compare_change(&golden, &format!("{name}#call2"), &after[1], &before[1]);
     }
     compare(&golden, "final_proj", &output.coarse_features[0]);
     compare(&golden, "final_proj#call2", &output.coarse_features[1]);
@@ -129,6 +124,6 @@ fn fine_points_are_matched_as_officially() {
 #[test]
 fn tensors_are_those_of_the_official_model() {
     let Some(official) = official_layout("cofinet") else { return };
-    assert!(layout(&Config::three_d_match()) == official);
-    assert!(layout(&Config::kitti()) == official);
+    assert!(layout(&CoFiNetConfig::three_d_match()) == official);
+    assert!(layout(&CoFiNetConfig::kitti()) == official);
 }

@@ -1,9 +1,10 @@
 //! Recorded pairs of clouds and stages of networks on them.
 
 use rare_nets::Matrix;
-use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid, PyramidConfig, StagePoints};
+use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid, PyramidConfig};
 use rare_nets::checkpoint::Parameters;
 
+use super::kpconv::golden_pyramid;
 use crate::shared::{self, GoldenTensors, relative_difference};
 
 /// The largest relative difference of features.
@@ -18,14 +19,8 @@ pub(crate) fn weights(name: &str) -> Option<Parameters> {
 
 /// The recorded points of all stages, and their neighbours found anew.
 pub(crate) fn pyramid(golden: &GoldenTensors, config: &PyramidConfig) -> Pyramid {
-    let stage = |level| {
-        let lengths = golden.array(&format!("in.lengths.{level}")).usize();
-        let values = golden.array(&format!("in.points.{level}")).f32();
-        let points = values.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect();
-        StagePoints { points, lengths: [lengths[0], lengths[1]] }
-    };
     let limits = NeighbourLimits(vec![24; config.stages]);
-    Pyramid::over((0..config.stages).map(stage).collect(), config, &limits).unwrap()
+    golden_pyramid(golden, config, &limits)
 }
 
 /// Compares features with a recorded array, whose rows may be the channels of sequences.
@@ -45,4 +40,10 @@ pub(crate) fn compare(golden: &GoldenTensors, name: &str, features: &Matrix) {
     let difference = relative_difference(features.values(), &values);
     println!("{name}: {difference:.1e}");
     assert!(difference < TOLERANCE, "{name}: {difference:.2e}");
+}
+
+/// Compares what a step added to features.
+pub(crate) fn compare_change(golden: &GoldenTensors, name: &str, after: &Matrix, before: &Matrix) {
+    let values = after.values().iter().zip(before.values()).map(|(a, b)| a - b).collect();
+    compare(golden, name, &Matrix::new(after.rows(), after.columns(), values).unwrap());
 }
