@@ -161,7 +161,7 @@ fn candidates(parameters: &Parameters) -> Vec<Candidate> {
 }
 
 fn fcgf_candidate(parameters: &Parameters) -> Candidate {
-    let config = fcgf::Config::of(parameters);
+    let config = fcgf::FcgfConfig::of(parameters);
     let unit = if config.unit_features { "of unit length" } else { "of any length" };
     Candidate {
         network: Network::Fcgf,

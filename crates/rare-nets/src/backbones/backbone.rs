@@ -26,7 +26,7 @@ impl Backbone {
     pub fn load(network: Network, parameters: &Parameters) -> Result<Backbone> {
         let (loaded, trained_on) = match network {
             Network::Fcgf => {
-                let config = fcgf::Config::of(parameters);
+                let config = fcgf::FcgfConfig::of(parameters);
                 let trained_on = TrainedOn::from_voxel(config.voxel);
                 (Loaded::Fcgf(Box::new(Fcgf::load(parameters, config)?)), trained_on)
             }

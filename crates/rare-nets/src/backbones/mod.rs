@@ -7,15 +7,20 @@
 //!
 //! | module | network | pose of its own |
 //! |---|---|---|
+//! | [`cofinet`] | CoFiNet (Yu et al.: NeurIPS 2021) | RANSAC |
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
+//! | [`predator`] | Predator (Huang et al.: CVPR 2021) | RANSAC |
 
 mod backbone;
+pub mod cofinet;
 pub mod fcgf;
+mod fitted;
+pub mod geotransformer;
+mod hourglass;
+pub mod kpconv;
+pub mod predator;
 
 pub use backbone::Backbone;
-
-pub mod geotransformer;
-pub mod kpconv;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};

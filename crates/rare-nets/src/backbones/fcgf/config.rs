@@ -6,12 +6,12 @@ use crate::checkpoint::Parameters;
 
 /// The settings of a model and of what is made of its features.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Config {
+pub struct FcgfConfig {
     /// Edge of a voxel, metres. It is not in the weights: it must be that of the training.
     pub voxel: f64,
-    /// Offsets along an edge of the first kernel, odd. [`Config::fitted`] takes it from the weights.
+    /// Offsets along an edge of the first kernel, odd. [`FcgfConfig::fitted`] takes it from the weights.
     pub first_kernel: usize,
-    /// Length of a feature. [`Config::fitted`] takes it from the weights.
+    /// Length of a feature. [`FcgfConfig::fitted`] takes it from the weights.
     pub features: usize,
     /// Whether features are divided by their norm.
     pub unit_features: bool,
@@ -33,12 +33,12 @@ pub enum Matching {
 /// What the authors' scripts search at most.
 const ITERATIONS: usize = 4_000_000;
 
-impl Config {
+impl FcgfConfig {
     /// Rooms at 2.5 cm, features of 32 numbers.
     #[must_use]
-    pub fn three_d_match() -> Config {
+    pub fn three_d_match() -> FcgfConfig {
         let voxel = 0.025;
-        Config {
+        FcgfConfig {
             voxel,
             first_kernel: 7,
             features: 32,
@@ -50,22 +50,22 @@ impl Config {
 
     /// Rooms at 5 cm.
     #[must_use]
-    pub fn three_d_match_coarse() -> Config {
+    pub fn three_d_match_coarse() -> FcgfConfig {
         let voxel = 0.05;
-        Config { voxel, ransac: ransac(1.5 * voxel), ..Config::three_d_match() }
+        FcgfConfig { voxel, ransac: ransac(1.5 * voxel), ..FcgfConfig::three_d_match() }
     }
 
     /// Streets at 30 cm.
     #[must_use]
-    pub fn kitti() -> Config {
+    pub fn kitti() -> FcgfConfig {
         let voxel = 0.3;
-        Config { voxel, first_kernel: 5, ransac: ransac(voxel), ..Config::three_d_match() }
+        FcgfConfig { voxel, first_kernel: 5, ransac: ransac(voxel), ..FcgfConfig::three_d_match() }
     }
 
     /// The published model that the weights are of: by the settings of their training, which the authors' files hold, or
     /// else by the size of the first kernel.
     #[must_use]
-    pub fn of(parameters: &Parameters) -> Config {
+    pub fn of(parameters: &Parameters) -> FcgfConfig {
         let setting = |name: &str| parameters.metadata().get(name).map(String::as_str);
         let voxel = setting("config.voxel_size").and_then(|text| text.parse::<f64>().ok());
         let voxel = voxel.filter(|voxel| *voxel > 0.0 && voxel.is_finite());
@@ -75,7 +75,7 @@ impl Config {
                 parameters.shape("conv1.kernel").is_some_and(|shape| shape.first() == Some(&125))
             }
         };
-        let config = if is_outdoors { Config::kitti() } else { Config::three_d_match() };
+        let config = if is_outdoors { FcgfConfig::kitti() } else { FcgfConfig::three_d_match() };
         let unit_features = match setting("config.normalize_feature") {
             Some("false") => false,
             Some("true") => true,
@@ -83,13 +83,13 @@ impl Config {
         };
         let voxel = voxel.unwrap_or(config.voxel);
         let threshold = config.ransac.inlier_threshold * voxel / config.voxel;
-        Config { voxel, unit_features, ransac: ransac(threshold), ..config }.fitted(parameters)
+        FcgfConfig { voxel, unit_features, ransac: ransac(threshold), ..config }.fitted(parameters)
     }
 
     /// With the size of the first kernel and the length of features that the weights have; unchanged where they have no
     /// such tensors.
     #[must_use]
-    pub fn fitted(mut self, parameters: &Parameters) -> Config {
+    pub fn fitted(mut self, parameters: &Parameters) -> FcgfConfig {
         if let Some([offsets, ..]) = parameters.shape("conv1.kernel") {
             let side = (1..=*offsets).take_while(|side| side * side * side <= *offsets).last();
             self.first_kernel = side.unwrap_or(self.first_kernel);

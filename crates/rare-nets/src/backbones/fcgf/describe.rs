@@ -5,7 +5,7 @@ use rare::nalgebra::Point3;
 use rare::pose::PoseEstimator;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
 
-use super::{Config, Fcgf, Matching};
+use super::{Fcgf, FcgfConfig, Matching};
 use crate::backbones::{Description, Keypoints, Selection, SelectionRule};
 
 impl Fcgf {
@@ -63,7 +63,7 @@ impl Fcgf {
     }
 }
 
-impl Config {
+impl FcgfConfig {
     fn matches(&self, source: &PointFeatures, target: &PointFeatures) -> Result<Vec<Match>> {
         match self.matching {
             Matching::Nearest => matching::nearest(source, target, None),

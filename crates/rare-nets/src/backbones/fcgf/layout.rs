@@ -1,6 +1,6 @@
 //! The tensors of `ResUNetBN2C`.
 
-use super::Config;
+use super::FcgfConfig;
 use crate::checkpoint::{Layout, Parameters};
 
 /// Channels of the four strides on the way down.
@@ -14,7 +14,7 @@ const POINTWISE: [&str; 2] = ["conv1_tr.kernel", "final.kernel"];
 
 /// The shape of every tensor of a model, kernels as `offsets x inputs x outputs`, as current files write them.
 #[must_use]
-pub fn layout(config: &Config) -> Layout {
+pub fn layout(config: &FcgfConfig) -> Layout {
     let mut layout = Layout::new();
     let offsets = config.first_kernel.saturating_pow(3);
     layout.insert("conv1.kernel".to_owned(), vec![offsets, 1, DOWN[0]]);
@@ -34,7 +34,7 @@ pub fn layout(config: &Config) -> Layout {
 
 /// The same with kernels of one offset as the weights have them.
 #[must_use]
-pub fn layout_as_stored(config: &Config, parameters: &Parameters) -> Layout {
+pub fn layout_as_stored(config: &FcgfConfig, parameters: &Parameters) -> Layout {
     let mut layout = layout(config);
     for name in POINTWISE {
         if let (Some([1, rest @ ..]), Some(shape)) = (parameters.shape(name), layout.get_mut(name))

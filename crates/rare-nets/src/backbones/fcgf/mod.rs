@@ -19,6 +19,6 @@ mod layout;
 mod network;
 mod voxels;
 
-pub use config::{Config, Matching};
+pub use config::{FcgfConfig, Matching};
 pub use layout::{layout, layout_as_stored};
 pub use network::{Fcgf, Output};

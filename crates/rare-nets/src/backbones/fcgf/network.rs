@@ -3,7 +3,7 @@
 use rare::nalgebra::Point3;
 use rare::{Error, Result};
 
-use super::Config;
+use super::FcgfConfig;
 use super::convolution::{FirstConvolution, SparseConvolution};
 use super::coordinates::{Coordinate, CoordinateMap};
 use super::kernel_map::KernelMap;
@@ -16,7 +16,7 @@ use crate::layers::{Activation, Linear, Weights, unit_rows};
 
 /// The network with its weights (Choy, Park, Koltun: Fully Convolutional Geometric Features, ICCV 2019).
 pub struct Fcgf {
-    pub(super) config: Config,
+    pub(super) config: FcgfConfig,
     cpu: CpuBackend,
     first: FirstConvolution,
     first_block: Block,
@@ -60,7 +60,7 @@ impl Fcgf {
     ///
     /// # Errors
     /// `InvalidInput` if they are not the weights of this network or are damaged; `Io`, `Unsupported` as the file has it.
-    pub fn load(parameters: &Parameters, config: Config) -> Result<Fcgf> {
+    pub fn load(parameters: &Parameters, config: FcgfConfig) -> Result<Fcgf> {
         let config = config.fitted(parameters);
         let layout = layout_as_stored(&config, parameters);
         let weights = Weights::new(parameters, &layout, "FCGF")?;

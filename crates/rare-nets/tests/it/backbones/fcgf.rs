@@ -3,7 +3,7 @@
 use rare::nalgebra::{Point3, Vector3};
 use rare_nets::Matrix;
 use rare_nets::backbones::Selection;
-use rare_nets::backbones::fcgf::{Config, Fcgf, layout};
+use rare_nets::backbones::fcgf::{Fcgf, FcgfConfig, layout};
 use rare_nets::checkpoint::Parameters;
 
 use super::formula::{official_layout, uniform, write_tensors};
@@ -12,12 +12,12 @@ use crate::shared::{GoldenTensors, relative_difference};
 /// The largest relative difference of features.
 const TOLERANCE: f64 = 1e-4;
 
-fn tiny() -> Config {
-    Config { voxel: 0.1, first_kernel: 5, ..Config::three_d_match() }
+fn tiny() -> FcgfConfig {
+    FcgfConfig { voxel: 0.1, first_kernel: 5, ..FcgfConfig::three_d_match() }
 }
 
 /// Weights by the formula of the recorded arrays; kernels with one offset have `leading` sizes before the others.
-pub(crate) fn weights(config: &Config, leading: &[usize]) -> Parameters {
+pub(crate) fn weights(config: &FcgfConfig, leading: &[usize]) -> Parameters {
     let tensor = |(name, shape): (&String, &Vec<usize>)| {
         let mut values = uniform(name, shape.iter().product());
         let fan_in = match shape.as_slice() {
@@ -88,7 +88,7 @@ fn every_stage_is_that_of_the_references() {
 #[test]
 fn tensors_are_those_of_the_official_model() {
     let Some(official) = official_layout("fcgf_resunetbn2c") else { return };
-    assert!(layout(&Config::three_d_match()) == official);
+    assert!(layout(&FcgfConfig::three_d_match()) == official);
 }
 
 #[test]
@@ -100,7 +100,7 @@ fn the_first_point_of_every_voxel_is_kept() {
     // The references divide in single precision: done here, for voxels of 1 m.
     let scaled = pair.array("in.points.0").f32();
     let scaled: Vec<f64> = scaled[..3 * count].iter().map(|x| f64::from(x / 0.1)).collect();
-    let network = Fcgf::load(&weights(&tiny(), &[]), Config { voxel: 1.0, ..tiny() }).unwrap();
+    let network = Fcgf::load(&weights(&tiny(), &[]), FcgfConfig { voxel: 1.0, ..tiny() }).unwrap();
     let kept = network.run(&points(&scaled)).unwrap().kept;
     assert!(kept == golden.array("in.sel").usize());
 }
@@ -108,9 +108,9 @@ fn the_first_point_of_every_voxel_is_kept() {
 #[test]
 fn kernels_with_a_leading_one_are_read_and_sizes_come_from_the_weights() {
     let Some(golden) = GoldenTensors::open("backbones/fcgf_tiny.safetensors") else { return };
-    let config = Config { features: 16, ..tiny() };
-    let new = Fcgf::load(&weights(&config, &[]), Config::three_d_match()).unwrap();
-    let old = Fcgf::load(&weights(&config, &[1]), Config::three_d_match()).unwrap();
+    let config = FcgfConfig { features: 16, ..tiny() };
+    let new = Fcgf::load(&weights(&config, &[]), FcgfConfig::three_d_match()).unwrap();
+    let old = Fcgf::load(&weights(&config, &[1]), FcgfConfig::three_d_match()).unwrap();
     let cloud = &centres(&golden)[..300];
     let output = old.run(cloud).unwrap();
     assert_eq!(output.features.columns(), 16);

@@ -45,7 +45,7 @@ fn measured<T>(what: &str, work: impl FnOnce() -> T) -> T {
 #[ignore = "measures"]
 fn fcgf_on_rooms() {
     let Some([source, target]) = rooms() else { return };
-    let config = fcgf::Config::three_d_match();
+    let config = fcgf::FcgfConfig::three_d_match();
     let network = fcgf::Fcgf::load(&super::fcgf::weights(&config, &[]), config).unwrap();
     measured("fcgf: source alone", || network.run(&source).unwrap());
     let selection = Selection { count: 5000, ..Selection::default() };
