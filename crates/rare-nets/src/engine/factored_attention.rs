@@ -9,6 +9,11 @@
 //! which is exact, and costs what the listed keys cost. Where nearly all keys are listed, the two sums could cancel:
 //! whoever lists the keys then lists all of them, and the first sum falls away.
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "iterators would move the vectors out of their registers"
+)]
+
 use std::borrow::Cow;
 use std::ops::Range;
 
@@ -67,6 +72,22 @@ impl FactorRows {
         let end = self.ends.get(query).copied().unwrap_or(0);
         let start = if query == 0 { 0 } else { self.ends.get(query - 1).copied().unwrap_or(end) };
         start.min(end)..end
+    }
+
+    /// The places of all listed keys, a block of keys after the other, query by query.
+    fn pieces(&self, keys: usize) -> Vec<(usize, Range<usize>)> {
+        let mut next: Vec<usize> =
+            (0..self.ends.len()).map(|query| self.range(query).start).collect();
+        let mut pieces = Vec::with_capacity(self.ends.len() * keys.div_ceil(KEYS));
+        for first in (0..keys).step_by(KEYS) {
+            for (query, next) in next.iter_mut().enumerate() {
+                let left = &self.keys[*next..self.ends[query]];
+                let end = *next + left.partition_point(|&key| (key as usize) < first + KEYS);
+                pieces.push((query, *next..end));
+                *next = end;
+            }
+        }
+        pieces
     }
 
     /// Whether these are rows of so many queries to so many keys, in order.
@@ -188,26 +209,21 @@ impl<const VECTORS: usize> Vectorized for Block<'_, VECTORS> {
 
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
+        // Plain loops: a closure is not compiled with the instructions of the loop that it is handed to.
         let mut weights = vec![0.0; self.rows.listed()];
-        self.in_blocks_of_keys(|block, query, listed| {
-            block.score(simd, query, listed, &mut weights)
-        });
-        let totals: Vec<Total> = (0..self.rows.ends.len())
-            .map(|query| {
-                let row = &mut weights[self.rows.range(query)];
-                exponentiate(simd, row, self.head.keys.matrix.rows())
-            })
-            .collect();
-        self.in_blocks_of_keys(|block, query, listed| block.weigh(simd, query, listed, &weights));
-        for (output, total) in
-            self.output.as_chunks_mut::<LANES>().0.chunks_exact_mut(VECTORS).zip(totals)
-        {
-            let (rest, inverse) = (simd.splat(total.rest), simd.splat(1.0 / total.weight));
-            for (output, sums) in output.iter_mut().zip(self.value_sums.as_chunks().0) {
-                let sum = simd.mul_add(rest, simd.load(sums), simd.load(output));
-                simd.store(simd.mul(sum, inverse), output);
-            }
+        let pieces = self.rows.pieces(self.head.keys.matrix.rows());
+        for (query, listed) in &pieces {
+            self.score(simd, *query, listed.clone(), &mut weights);
         }
+        let mut totals = Vec::with_capacity(self.rows.ends.len());
+        for query in 0..self.rows.ends.len() {
+            let row = &mut weights[self.rows.range(query)];
+            totals.push(exponentiate(simd, row, self.head.keys.matrix.rows()));
+        }
+        for (query, listed) in &pieces {
+            self.weigh(simd, *query, listed.clone(), &weights);
+        }
+        self.finish(simd, &totals);
     }
 }
 
@@ -220,18 +236,15 @@ struct Total {
 }
 
 impl<const VECTORS: usize> Block<'_, VECTORS> {
-    /// Calls `work(self, query, listed)` for the listed keys of each query, a block of keys after the other.
+    /// Adds what all keys have in common, and divides by the weights.
     #[inline(always)]
-    fn in_blocks_of_keys(&mut self, mut work: impl FnMut(&mut Self, usize, Range<usize>)) {
-        let rows = self.rows;
-        let mut next: Vec<usize> =
-            (0..rows.ends.len()).map(|query| rows.range(query).start).collect();
-        for first in (0..self.head.keys.matrix.rows()).step_by(KEYS) {
-            for (query, next) in next.iter_mut().enumerate() {
-                let left = &rows.keys[*next..rows.ends[query]];
-                let end = *next + left.partition_point(|&key| (key as usize) < first + KEYS);
-                work(self, query, *next..end);
-                *next = end;
+    fn finish<S: Simd>(&mut self, simd: S, totals: &[Total]) {
+        let output = self.output.as_chunks_mut::<LANES>().0.chunks_exact_mut(VECTORS);
+        for (output, total) in output.zip(totals) {
+            let (rest, inverse) = (simd.splat(total.rest), simd.splat(1.0 / total.weight));
+            for (output, sums) in output.iter_mut().zip(self.value_sums.as_chunks().0) {
+                let sum = simd.mul_add(rest, simd.load(sums), simd.load(output));
+                simd.store(simd.mul(sum, inverse), output);
             }
         }
     }
@@ -240,25 +253,30 @@ impl<const VECTORS: usize> Block<'_, VECTORS> {
     #[inline(always)]
     fn score<S: Simd>(&self, simd: S, query: usize, listed: Range<usize>, scores: &mut [f32]) {
         let scale = std::f32::consts::LOG2_E / (self.head.channels as f32).sqrt();
-        let Some(query) = self.head.queries.row::<VECTORS>(self.first + query) else { return };
-        let query = query.map(|lanes| simd.load(&lanes));
+        let Some(asked) = self.head.queries.row::<VECTORS>(self.first + query) else { return };
+        let mut query = [simd.splat(0.0); VECTORS];
+        for vector in 0..VECTORS {
+            query[vector] = simd.load(&asked[vector]);
+        }
         let keys = self.rows.keys[listed.clone()].chunks(BATCH);
         let factors = self.rows.factors[listed.clone()].chunks(BATCH);
         for ((scores, keys), factors) in scores[listed].chunks_mut(BATCH).zip(keys).zip(factors) {
+            // What a short batch lacks is computed for nothing.
+            let key =
+                |at: usize| self.head.keys.row::<VECTORS>(keys[at.min(keys.len() - 1)] as usize);
+            let (Some(a), Some(b), Some(c), Some(d)) = (key(0), key(1), key(2), key(3)) else {
+                return;
+            };
+            let rows = [a, b, c, d];
             let mut sums = [simd.splat(0.0); BATCH];
-            // The last ones of a short batch are computed for nothing.
-            let rows: [_; BATCH] = std::array::from_fn(|at| {
-                let key = keys.get(at).or(keys.first()).map_or(0, |&key| key as usize);
-                self.head.keys.row::<VECTORS>(key)
-            });
-            let [Some(a), Some(b), Some(c), Some(d)] = rows else { return };
             for vector in 0..VECTORS {
-                for (sum, row) in sums.iter_mut().zip([a, b, c, d]) {
-                    *sum = simd.mul_add(query[vector], simd.load(&row[vector]), *sum);
+                for at in 0..BATCH {
+                    sums[at] = simd.mul_add(query[vector], simd.load(&rows[at][vector]), sums[at]);
                 }
             }
+            let sums = [simd.sum(sums[0]), simd.sum(sums[1]), simd.sum(sums[2]), simd.sum(sums[3])];
             for ((score, sum), factor) in scores.iter_mut().zip(sums).zip(factors) {
-                *score = simd.sum(sum) * (factor * scale);
+                *score = sum * (factor * scale);
             }
         }
     }
@@ -267,10 +285,11 @@ impl<const VECTORS: usize> Block<'_, VECTORS> {
     #[inline(always)]
     fn weigh<S: Simd>(&mut self, simd: S, query: usize, listed: Range<usize>, weights: &[f32]) {
         let output = self.output.as_chunks_mut::<LANES>().0;
-        let output =
-            output.get_mut(query * VECTORS..).and_then(|rest| rest.first_chunk_mut::<VECTORS>());
-        let Some(output) = output else { return };
-        let mut sums = output.map(|lanes| simd.load(&lanes));
+        let Some(output) = output.get_mut(query * VECTORS..(query + 1) * VECTORS) else { return };
+        let mut sums = [simd.splat(0.0); VECTORS];
+        for vector in 0..VECTORS {
+            sums[vector] = simd.load(&output[vector]);
+        }
         for (&key, &weight) in self.rows.keys[listed.clone()].iter().zip(&weights[listed]) {
             let Some(values) = self.head.values.row::<VECTORS>(key as usize) else { return };
             let weight = simd.splat(weight);
@@ -278,8 +297,8 @@ impl<const VECTORS: usize> Block<'_, VECTORS> {
                 sums[vector] = simd.mul_add(weight, simd.load(&values[vector]), sums[vector]);
             }
         }
-        for (sum, output) in sums.into_iter().zip(output) {
-            simd.store(sum, output);
+        for vector in 0..VECTORS {
+            simd.store(sums[vector], &mut output[vector]);
         }
     }
 }
@@ -288,21 +307,34 @@ impl<const VECTORS: usize> Block<'_, VECTORS> {
 #[inline(always)]
 fn exponentiate<S: Simd>(simd: S, row: &mut [f32], count: usize) -> Total {
     let all_listed = row.len() == count;
-    let least = if all_listed { f32::MIN } else { 0.0 };
-    let (lanes, tail) = row.as_chunks::<LANES>();
-    let largest =
-        lanes.iter().fold(simd.splat(least), |largest, lanes| simd.max(largest, simd.load(lanes)));
-    let largest = tail.iter().copied().fold(simd.maximum(largest), f32::max);
+    let largest = maximum(simd, row, if all_listed { f32::MIN } else { 0.0 });
     let rest = if all_listed { 0.0 } else { (-largest).exp2() };
     let (shift, excess) = (simd.splat(-largest), simd.splat(-rest));
     for start in (0..row.len()).step_by(LANES) {
         let weight = exp2(simd, simd.add(load(simd, row, start), shift));
         store(simd, simd.add(weight, excess), row, start);
     }
+    Total { rest, weight: sum(simd, row) + rest * count as f32 }
+}
+
+#[inline(always)]
+fn maximum<S: Simd>(simd: S, row: &[f32], least: f32) -> f32 {
     let (lanes, tail) = row.as_chunks::<LANES>();
-    let sum = lanes.iter().fold(simd.splat(0.0), |sum, lanes| simd.add(sum, simd.load(lanes)));
-    let listed = simd.sum(sum) + tail.iter().sum::<f32>();
-    Total { rest, weight: listed + rest * count as f32 }
+    let mut largest = simd.splat(least);
+    for lanes in lanes {
+        largest = simd.max(largest, simd.load(lanes));
+    }
+    tail.iter().copied().fold(simd.maximum(largest), f32::max)
+}
+
+#[inline(always)]
+fn sum<S: Simd>(simd: S, row: &[f32]) -> f32 {
+    let (lanes, tail) = row.as_chunks::<LANES>();
+    let mut sum = simd.splat(0.0);
+    for lanes in lanes {
+        sum = simd.add(sum, simd.load(lanes));
+    }
+    simd.sum(sum) + tail.iter().sum::<f32>()
 }
 
 #[cfg(test)]
