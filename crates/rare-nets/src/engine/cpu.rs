@@ -9,9 +9,11 @@ use super::arena::Arena;
 use super::attention::{self, Keys};
 use super::backend::{Backend, Convolution, Kernel, Shape};
 use super::convolution::{self, Context};
+use super::factored_attention::{self, Head, ScoreFactors};
 use super::pack::{self, PackedWeight};
 use super::simd::Processor;
 use super::tensor::{Elements, Tensor, Values};
+use crate::Matrix;
 
 /// The precision of products. Sums are always in single precision.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -70,6 +72,19 @@ impl CpuBackend {
     #[must_use]
     pub fn processor(&self) -> Processor {
         self.processor
+    }
+
+    /// Attention whose scores are multiplied by factors before the softmax:
+    /// `softmax(factor * (query . key) / sqrt(channels)) value` for each query. Always in single precision.
+    ///
+    /// # Errors
+    /// `Internal` if the sizes do not fit; there must be 16, 32, 64 or 128 channels.
+    pub(crate) fn factored_attention(
+        &self,
+        head: &Head<'_>,
+        factors: &impl ScoreFactors,
+    ) -> Result<Matrix> {
+        factored_attention::attend(self.processor, head, factors)
     }
 
     fn context(&self) -> Context<'_> {

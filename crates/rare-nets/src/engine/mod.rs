@@ -15,6 +15,7 @@ mod backend;
 mod convolution;
 mod cpu;
 mod epilogue;
+mod factored_attention;
 mod math;
 mod normalization;
 mod operand;
@@ -28,6 +29,9 @@ mod winograd;
 
 pub use backend::{Activation, Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
 pub use cpu::{CpuBackend, Precision};
+pub(crate) use factored_attention::{
+    Columns, FactorRows, Head, QUERIES as FACTORED_QUERIES, ScoreFactors,
+};
 pub use pack::PackedWeight;
 pub use simd::Processor;
 pub use tensor::Tensor;

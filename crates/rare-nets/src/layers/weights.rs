@@ -7,6 +7,9 @@ use crate::Matrix;
 use crate::checkpoint::{Layout, Parameters, require};
 use crate::engine::CpuBackend;
 
+/// Added to the variances of batch normalisations.
+const NORMALISATION_EPSILON: f64 = 1e-5;
+
 /// Reads the tensors of a network, each with the shape that its layout says.
 pub(crate) struct Weights<'a> {
     parameters: &'a Parameters,
@@ -82,5 +85,55 @@ impl<'a> Weights<'a> {
         let bias = format!("{name}.bias");
         let bias = if self.has(&bias) { Some(self.values(&bias)?) } else { None };
         Linear::new(cpu, self.matrix(&format!("{name}.weight"))?, bias.as_deref())
+    }
+
+    /// The linear layers of these names as one, their outputs one after the other. All have a bias.
+    ///
+    /// # Errors
+    /// Those of [`Weights::matrix`].
+    pub(crate) fn stacked_linear(&self, cpu: &CpuBackend, names: &[String]) -> Result<Linear> {
+        let mut weight: Option<Matrix> = None;
+        let mut bias = Vec::new();
+        for name in names {
+            let part = self.matrix(&format!("{name}.weight"))?;
+            weight = Some(match weight {
+                Some(above) => above.stacked(&part)?,
+                None => part,
+            });
+            bias.extend(self.values(&format!("{name}.bias"))?);
+        }
+        let weight = weight.ok_or_else(|| Error::Internal("no layers to stack".to_owned()))?;
+        Linear::new(cpu, weight, Some(&bias))
+    }
+
+    /// The linear layer `name`, which has a bias, and the batch normalisation `norm` after it (Ioffe and Szegedy, 2015)
+    /// as one linear layer.
+    ///
+    /// # Errors
+    /// Those of [`Weights::matrix`]; `InvalidInput` if a variance is negative.
+    pub(crate) fn normalised_linear(
+        &self,
+        cpu: &CpuBackend,
+        name: &str,
+        norm: &str,
+    ) -> Result<Linear> {
+        let mut weight = self.matrix(&format!("{name}.weight"))?;
+        let mut bias = self.values(&format!("{name}.bias"))?;
+        let part = |part: &str| self.values(&format!("{norm}.{part}"));
+        let (scale, shift) = (part("weight")?, part("bias")?);
+        let (mean, variance) = (part("running_mean")?, part("running_var")?);
+        if let Some(negative) = variance.iter().find(|&&variance| variance < 0.0) {
+            return Err(Error::invalid(format!("{norm}.running_var holds {negative}")));
+        }
+        let columns = weight.columns().max(1);
+        let rows = weight.values_mut().chunks_exact_mut(columns).zip(&mut bias);
+        let affine = scale.iter().zip(&shift).zip(mean.iter().zip(&variance));
+        for ((row, bias), ((&scale, shift), (mean, &variance))) in rows.zip(affine) {
+            let factor = f64::from(scale) / (f64::from(variance) + NORMALISATION_EPSILON).sqrt();
+            row.iter_mut().for_each(|value| *value = (f64::from(*value) * factor) as f32);
+            let centred = f64::from(*bias) - f64::from(*mean);
+            *bias = (centred * factor + f64::from(*shift)) as f32;
+        }
+        Linear::new(cpu, weight, Some(&bias))
     }
 }

@@ -1,1 +1,16 @@
 //! Networks that tell right correspondences from wrong ones.
+//!
+//! Each is a [`rare::pose::PoseEstimator`]: correspondences in, a rigid transform with evidence out. Both see the
+//! coordinates of the pairs and nothing else, and attend from each pair to those that keep their distance to it.
+//!
+//! | module | network | pose around a seed |
+//! |---|---|---|
+//! | [`pointdsc`] | PointDSC (Bai et al., CVPR 2021) | its neighbours in feature space |
+
+mod compatibility;
+mod encoder;
+pub mod pointdsc;
+mod seed_consensus;
+
+pub use pointdsc::{PointDsc, PointDscConfig};
+pub use seed_consensus::SeedConsensus;

@@ -14,6 +14,7 @@ mod engine;
 mod network_shapes;
 mod networks;
 mod official;
+mod outliers;
 mod pickle_writer;
 mod pipeline;
 mod reference_backend;

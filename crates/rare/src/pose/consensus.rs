@@ -28,7 +28,10 @@ impl Hypothesis {
 }
 
 /// Fails unless there are three pairs or more, all finite.
-pub(super) fn validate(pairs: &[Correspondence]) -> Result<()> {
+///
+/// # Errors
+/// `NoPose` if there are fewer; `InvalidInput` if a coordinate or a score is not finite.
+pub fn validate(pairs: &[Correspondence]) -> Result<()> {
     if pairs.len() < 3 {
         return Err(Error::no_pose(format!(
             "a pose needs at least 3 correspondences, there are {}",

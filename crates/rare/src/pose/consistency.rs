@@ -75,8 +75,8 @@ impl Consistency {
         soft(self.difference(i, j), threshold as f32)
     }
 
-    /// `D_ij` for `j = first, first + 1, ...`, as many as `row` has room for.
-    fn differences(&self, i: usize, first: usize, row: &mut [f32]) {
+    /// `D_ij` for `j = first, first + 1, ...`, as many as `row` has room for: the caller knows that there are so many.
+    pub fn differences(&self, i: usize, first: usize, row: &mut [f32]) {
         let end = first + row.len();
         let columns = |columns: &Columns| (columns.x[i], columns.y[i], columns.z[i]);
         let (px, py, pz) = columns(&self.source);

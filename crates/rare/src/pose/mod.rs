@@ -10,27 +10,33 @@ mod local_to_global;
 mod mac;
 mod normal_equations;
 mod partners;
+mod pose_choice;
 mod ransac;
 mod rigid_fit;
 mod robust_kernel;
 mod sc2_pcr;
 mod sc2_pcr_plus_plus;
+mod seeds;
 mod significance;
 mod spectral;
 
 pub(crate) use anchored_icp::RING_REACH;
 pub use anchored_icp::{AnchoredIcp, AnchoredIcpResult};
+pub use consensus::validate as validate_pairs;
 pub use consistency::{CompatibilityGraph, Consistency};
 pub use fast_mac::FastMac;
 pub use icp::{Icp, IcpMethod, IcpResult, IcpStage, MultiScaleIcp, OpenDirection, Trim};
 pub use icp_target::{IcpSource, IcpTarget};
 pub use local_to_global::LocalToGlobal;
 pub use mac::{FirstOrderScore, Mac};
+pub use pose_choice::PoseChoice;
 pub use ransac::{Ransac, RansacScore};
 pub use rigid_fit::fit_weighted;
 pub use robust_kernel::RobustKernel;
 pub use sc2_pcr::{Sc2Pcr, Sc2PcrSeeds};
 pub use sc2_pcr_plus_plus::{FeatureCandidates, Sc2PcrPlusPlus};
+pub use seeds::spread_seeds;
+pub use spectral::leading_eigenvector;
 
 use serde::{Deserialize, Serialize};
 

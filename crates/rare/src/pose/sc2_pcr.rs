@@ -7,14 +7,14 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::data::{Correspondence, KdTree, PointCloud};
+use crate::data::{Correspondence, PointCloud};
 use crate::error::{Error, Result};
 use crate::pose::consensus::{self, Difference, Hypothesis, Keep, Polish};
 use crate::pose::consistency::SoftMatrix;
 use crate::pose::significance;
-use crate::pose::spectral::leading_eigenvector;
 use crate::pose::{
     CompatibilityGraph, Consistency, Mode, PoseEstimate, PoseEstimator, fit_weighted,
+    leading_eigenvector, spread_seeds,
 };
 
 /// The settings of SC2-PCR; lengths in metres.
@@ -275,30 +275,11 @@ impl<'a> Search<'a> {
 
     fn seeds(&self) -> Sc2PcrSeeds {
         let confidences = self.confidences();
-        let is_maximum = self.local_maxima(&confidences);
-        let mut indices: Vec<usize> = (0..confidences.len()).collect();
-        // Those that are no maxima count as confidence 0.
-        let key = |i: usize| if is_maximum[i] { confidences[i] } else { 0.0 };
-        indices.sort_by(|&a, &b| key(b).total_cmp(&key(a)));
-        let count = (self.settings.seed_ratio * self.pairs.len() as f64) as usize;
-        indices.truncate(count.max(1));
-        if self.settings.mode == Mode::Fixed {
-            indices.retain(|&i| is_maximum[i]);
-        }
-        Sc2PcrSeeds { confidences, indices }
-    }
-
-    fn local_maxima(&self, confidences: &[f64]) -> Vec<bool> {
         let points: Vec<_> = self.pairs.iter().map(|pair| pair.source).collect();
-        let tree = KdTree::new(&points);
-        let mut near = Vec::new();
-        (points.iter().zip(confidences))
-            .map(|(point, confidence)| {
-                let radius = self.settings.suppression_radius;
-                tree.k_nearest_unordered(point, usize::MAX, radius, &mut near);
-                near.iter().all(|other| *confidence >= confidences[other.index])
-            })
-            .collect()
+        let count = (self.settings.seed_ratio * self.pairs.len() as f64) as usize;
+        let Sc2Pcr { suppression_radius, mode, .. } = *self.settings;
+        let indices = spread_seeds(&points, &confidences, suppression_radius, count.max(1), mode);
+        Sc2PcrSeeds { confidences, indices }
     }
 
     fn pose_around(&self, seed: usize) -> Option<Hypothesis> {

@@ -4,7 +4,8 @@
 /// `rounds` products, ended early when no element changes by more than `1e-8 + 1e-5` of itself.
 ///
 /// `multiply(vector, product)` forms the product. The result is non-negative and has (nearly) unit length.
-pub(super) fn leading_eigenvector(
+#[must_use]
+pub fn leading_eigenvector(
     size: usize,
     rounds: usize,
     mut multiply: impl FnMut(&[f64], &mut [f64]),
