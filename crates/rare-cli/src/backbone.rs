@@ -107,7 +107,8 @@ pub(crate) fn open_filter(
     settings: &Settings,
 ) -> Result<Box<dyn PoseEstimator>> {
     let parameters = networks::open(file)?;
-    networks::open_filter(network, &parameters, settings.refiner.seed)
+    let noise = settings.vbreg_noise.then_some(settings.refiner.seed);
+    networks::open_filter(network, &parameters, noise)
         .with_context(|| format!("--weights {}", file.display()))
 }
 

@@ -81,6 +81,9 @@ pub(crate) struct Options {
     /// never published, by their rule from the clouds]
     #[arg(long, value_name = "N,N,...", value_delimiter = ',')]
     pub(crate) neighbor_limits: Option<Vec<usize>>,
+    /// Let VBReg sample its states, as its authors do (with --seed), instead of taking their means
+    #[arg(long, num_args = 0, default_missing_value = "true")]
+    pub(crate) vbreg_noise: Option<bool>,
     /// How often the clouds are looked at and matched, each time under the transform found before [default: 2; with
     /// --preset paper or --encoder recorded: 1]
     #[arg(long, value_name = "N")]
@@ -148,6 +151,8 @@ pub(crate) struct Settings {
     pub(crate) backbone: Option<Backbone>,
     /// Weights of the networks, in the order given.
     pub(crate) weights: Vec<PathBuf>,
+    /// Whether VBReg samples its states.
+    pub(crate) vbreg_noise: bool,
     /// How the initial transform is estimated, if that was said.
     pub(crate) init_method: Option<InitMethod>,
     /// 0: as many as there are cores.
@@ -212,6 +217,7 @@ impl Options {
             diffusion,
             backbone,
             weights: self.weights,
+            vbreg_noise: self.vbreg_noise.unwrap_or(false),
             init_method: self.init_method,
             threads: self.threads.unwrap_or(0),
             quiet: self.quiet.unwrap_or(false),
@@ -254,6 +260,7 @@ impl Options {
             keypoints: self.keypoints.or(other.keypoints),
             keypoint_rule: self.keypoint_rule.or(other.keypoint_rule),
             neighbor_limits: self.neighbor_limits.or(other.neighbor_limits),
+            vbreg_noise: self.vbreg_noise.or(other.vbreg_noise),
             rounds: self.rounds.or(other.rounds),
             no_verify: self.no_verify.or(other.no_verify),
             no_search: self.no_search.or(other.no_search),

@@ -3,11 +3,17 @@
 use std::fmt;
 use std::path::Path;
 
-use rare::pose::PoseEstimator;
+use rare::pose::{Mode, PoseEstimator};
 use rare::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-use crate::backbones::{Backbone, fcgf};
+use crate::backbones::cofinet::{self, CoFiNetConfig};
+use crate::backbones::fcgf::{self, FcgfConfig};
+use crate::backbones::geotransformer::{self, GeoTransformerConfig};
+use crate::backbones::predator::{self, PredatorConfig};
+use crate::backbones::{Backbone, fitted};
+use crate::outliers::pointdsc::{self, PointDsc, PointDscConfig};
+use crate::outliers::vbreg::{self, Vbreg, VbregConfig};
 use crate::checkpoint::{Differences, Layout, Parameters, compare};
 
 /// A network on points.
@@ -155,13 +161,61 @@ pub fn identify(parameters: &Parameters) -> Option<Identity> {
     })
 }
 
-/// Every network, with the sizes that the weights would have if they were of it.
+/// Every network, with the sizes that the weights would have if they were of it. Where even those cannot be told, they
+/// are of another one.
 fn candidates(parameters: &Parameters) -> Vec<Candidate> {
-    vec![fcgf_candidate(parameters)]
+    let backbones = [
+        fitted::geotransformer(parameters).ok().map(|config| geotransformer_candidate(&config)),
+        fitted::predator(parameters).ok().map(|config| predator_candidate(&config)),
+        fitted::cofinet(parameters).ok().map(|config| cofinet_candidate(&config)),
+        Some(fcgf_candidate(parameters)),
+    ];
+    let filters = [(Network::PointDsc, pointdsc::layout()), (Network::Vbreg, vbreg::layout())];
+    let filters = filters.map(|(network, layout)| filter_candidate(network, layout, parameters));
+    backbones.into_iter().flatten().chain(filters).collect()
+}
+
+fn geotransformer_candidate(config: &GeoTransformerConfig) -> Candidate {
+    let (stages, voxel) = (config.pyramid.stages, config.pyramid.voxel);
+    Candidate {
+        network: Network::GeoTransformer,
+        trained_on: TrainedOn::from_voxel(voxel),
+        configuration: format!(
+            "{stages} stages, the first of points {voxel} m apart; {} features",
+            config.features
+        ),
+        layout: geotransformer::layout(config),
+    }
+}
+
+fn predator_candidate(config: &PredatorConfig) -> Candidate {
+    let (stages, voxel) = (config.pyramid.stages, config.pyramid.voxel);
+    Candidate {
+        network: Network::Predator,
+        trained_on: TrainedOn::from_voxel(voxel),
+        configuration: format!(
+            "{stages} stages, the first of points {voxel} m apart; {} features",
+            config.features
+        ),
+        layout: predator::layout(config),
+    }
+}
+
+fn cofinet_candidate(config: &CoFiNetConfig) -> Candidate {
+    let (stages, voxel) = (config.pyramid.stages, config.pyramid.voxel);
+    Candidate {
+        network: Network::CoFiNet,
+        trained_on: TrainedOn::from_voxel(voxel),
+        configuration: format!(
+            "{stages} stages, the first of points {voxel} m apart; {} features",
+            config.features
+        ),
+        layout: cofinet::layout(config),
+    }
 }
 
 fn fcgf_candidate(parameters: &Parameters) -> Candidate {
-    let config = fcgf::FcgfConfig::of(parameters);
+    let config = FcgfConfig::of(parameters);
     let unit = if config.unit_features { "of unit length" } else { "of any length" };
     Candidate {
         network: Network::Fcgf,
@@ -174,26 +228,71 @@ fn fcgf_candidate(parameters: &Parameters) -> Candidate {
     }
 }
 
+fn filter_candidate(network: Network, layout: Layout, parameters: &Parameters) -> Candidate {
+    let reach = compatible_difference(parameters);
+    Candidate {
+        network,
+        trained_on: trained_filter(reach),
+        configuration: match reach {
+            Some(reach) => format!("lengths of right pairs differ by less than {reach} m"),
+            None => "lengths of right pairs: not stated".to_owned(),
+        },
+        layout,
+    }
+}
+
+/// The difference of lengths, metres, up to which a filter takes two pairs for compatible: a parameter of its training.
+fn compatible_difference(parameters: &Parameters) -> Option<f32> {
+    parameters.read("sigma_spat", &[1]).ok()?.to_f32().first().copied()
+}
+
+/// Rooms: 10 cm; streets: 1.2 m.
+fn trained_filter(compatible_difference: Option<f32>) -> TrainedOn {
+    match compatible_difference {
+        Some(difference) if difference > 0.4 => TrainedOn::Kitti,
+        _ => TrainedOn::ThreeDMatch,
+    }
+}
+
 /// Reads all weights of a network once.
 ///
 /// # Errors
 /// If some are missing, of another shape, or not finite.
 pub fn check(identity: &Identity, parameters: &Parameters) -> Result<()> {
     if identity.network.is_filter() {
-        open_filter(identity.network, parameters, 0).map(|_| ())
+        open_filter(identity.network, parameters, None).map(|_| ())
     } else {
         Backbone::load(identity.network, parameters).map(|_| ())
     }
 }
 
-/// Opens a network that tells right correspondences from wrong ones; `seed` is that of its random choices.
+/// Opens a network that tells right correspondences from wrong ones, with the lengths of what it was trained on. With
+/// `noise`, a seed, VBReg samples its states, as its authors let it; otherwise it takes their means.
 ///
 /// # Errors
-/// If the weights are of another network, or damaged; `Internal` if the network is none of this kind.
+/// `InvalidInput` if the weights are of another network, or damaged; `Internal` if the network is none of this kind.
 pub fn open_filter(
     network: Network,
-    _parameters: &Parameters,
-    _seed: u64,
+    parameters: &Parameters,
+    noise: Option<u64>,
 ) -> Result<Box<dyn PoseEstimator>> {
-    Err(Error::Internal(format!("{network} filters no correspondences")))
+    let trained_on = trained_filter(compatible_difference(parameters));
+    Ok(match (network, trained_on) {
+        (Network::PointDsc, TrainedOn::ThreeDMatch) => {
+            Box::new(PointDsc::load(parameters, PointDscConfig::three_d_match(Mode::Fixed))?)
+        }
+        (Network::PointDsc, TrainedOn::Kitti) => {
+            Box::new(PointDsc::load(parameters, PointDscConfig::kitti(Mode::Fixed))?)
+        }
+        (Network::Vbreg, trained_on) => {
+            let config = match trained_on {
+                TrainedOn::ThreeDMatch => VbregConfig::three_d_match(Mode::Fixed),
+                TrainedOn::Kitti => VbregConfig::kitti(Mode::Fixed),
+            };
+            Box::new(Vbreg::load(parameters, VbregConfig { noise, ..config })?)
+        }
+        (network, _) => {
+            return Err(Error::Internal(format!("{network} filters no correspondences")));
+        }
+    })
 }

@@ -77,6 +77,7 @@ fn settings(registration: &Registration) -> Vec<String> {
         let limits = backbone.neighbour_limits.iter();
         words.extend(limits.flat_map(|limits| option("--neighbor-limits", joined(limits))));
     }
+    words.extend(flag(settings.vbreg_noise, "--vbreg-noise"));
     let weights = settings.weights.iter();
     words.extend(weights.flat_map(|path| option("--weights", path.display().to_string())));
     let keypoints = recipe.keypoints.iter();

@@ -14,7 +14,7 @@
 mod backbone;
 pub mod cofinet;
 pub mod fcgf;
-mod fitted;
+pub(crate) mod fitted;
 pub mod geotransformer;
 mod hourglass;
 pub mod kpconv;
