@@ -11,6 +11,7 @@ use super::backend::{Backend, Convolution, Kernel, Shape};
 use super::convolution::{self, Context};
 use super::factored_attention::{self, Head, ScoreFactors};
 use super::pack::{self, PackedWeight};
+use super::recurrent::GatedUpdate;
 use super::simd::Processor;
 use super::tensor::{Elements, Tensor, Values};
 use crate::Matrix;
@@ -85,6 +86,27 @@ impl CpuBackend {
         factors: &impl ScoreFactors,
     ) -> Result<Matrix> {
         factored_attention::attend(self.processor, head, factors)
+    }
+
+    /// One step of a gated recurrent unit (Cho et al., 2014) for each row of `states`, from `input = W_i u + b_i` and
+    /// `hidden = W_h state + b_h`: three gates each, in the order reset, update, new.
+    ///
+    /// # Errors
+    /// `Internal` if the sizes do not fit.
+    pub(crate) fn gated_update(
+        &self,
+        input: &Matrix,
+        hidden: &Matrix,
+        states: &mut Matrix,
+    ) -> Result<()> {
+        let (rows, width) = (states.rows(), states.columns());
+        let fits = |gates: &Matrix| gates.rows() == rows && gates.columns() == 3 * width;
+        if width == 0 || !fits(input) || !fits(hidden) {
+            return Err(Error::Internal(format!("no gates of {rows} states of {width} numbers")));
+        }
+        let (input, hidden, states) = (input.values(), hidden.values(), states.values_mut());
+        self.processor.run(GatedUpdate { width, input, hidden, states });
+        Ok(())
     }
 
     fn context(&self) -> Context<'_> {

@@ -20,6 +20,7 @@ mod math;
 mod normalization;
 mod operand;
 mod pack;
+mod recurrent;
 mod shared_output;
 mod simd;
 mod tensor;

@@ -6,11 +6,14 @@
 //! | module | network | pose around a seed |
 //! |---|---|---|
 //! | [`pointdsc`] | PointDSC (Bai et al., CVPR 2021) | its neighbours in feature space |
+//! | [`vbreg`] | VBReg (Jiang et al., CVPR 2023) | those that the attention of all layers votes for |
 
 mod compatibility;
 mod encoder;
 pub mod pointdsc;
 mod seed_consensus;
+pub mod vbreg;
 
 pub use pointdsc::{PointDsc, PointDscConfig};
 pub use seed_consensus::SeedConsensus;
+pub use vbreg::{Vbreg, VbregConfig};

@@ -108,11 +108,19 @@ impl SeedConsensus {
         pairs: &[Correspondence],
         score: impl Fn(f64) -> f64,
     ) -> Result<PoseEstimate> {
-        self.choice.choose(poses, pairs, |pose| {
-            let residual = |pair: &Correspondence| (pose.apply(&pair.source) - pair.target).norm();
-            let sum: f64 = pairs.iter().map(|pair| score(residual(pair))).sum();
-            sum / pairs.len().max(1) as f64
-        })
+        self.choice.choose(poses, pairs, |pose| self.mean(pose, pairs, &score))
+    }
+
+    /// The mean of `score` over the residuals (metres) of all pairs.
+    pub(crate) fn mean(
+        &self,
+        pose: &RigidTransform,
+        pairs: &[Correspondence],
+        score: impl Fn(f64) -> f64,
+    ) -> f64 {
+        let residual = |pair: &Correspondence| (pose.apply(&pair.source) - pair.target).norm();
+        let sum: f64 = pairs.iter().map(|pair| score(residual(pair))).sum();
+        sum / pairs.len().max(1) as f64
     }
 }
 

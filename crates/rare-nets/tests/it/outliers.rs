@@ -5,10 +5,12 @@
 //! So everything on the way is compared.
 
 mod pointdsc;
+mod vbreg;
 
 use rare::nalgebra::{Point3, Vector3};
+use rare::pose::PoseEstimator;
 use rare::random::Random;
-use rare::{Correspondence, PointCloud, RigidTransform};
+use rare::{Correspondence, Error, PointCloud, RigidTransform};
 use rare_nets::Matrix;
 use rare_nets::checkpoint::{Layout, Parameters};
 
@@ -97,4 +99,24 @@ fn motion() -> RigidTransform {
 /// What `work` gives on so many threads.
 fn on_threads<T: Send>(threads: usize, work: impl FnOnce() -> T + Send) -> T {
     rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(work)
+}
+
+/// Right pairs are found among random ones; without right ones, or with nonsense, there is no pose.
+fn solves_the_clear_and_refuses_the_hopeless(network: &dyn PoseEstimator) {
+    let estimate = |pairs: &[Correspondence]| network.estimate(&no_cloud(), &no_cloud(), pairs);
+    let clear = estimate(&random_pairs(300, 200)).unwrap();
+    assert!((clear.target_from_source.to_matrix() - motion().to_matrix()).amax() < 1e-6);
+    assert!((0..200).all(|i| clear.inliers.contains(&i)));
+    assert!(clear.runner_up.is_none_or(|other| other <= clear.score));
+    assert!(matches!(estimate(&random_pairs(300, 0)), Err(Error::NoPose { .. })));
+    for few in 0..12 {
+        if let Err(error) = estimate(&random_pairs(few, few)) {
+            assert!(matches!(error, Error::NoPose { .. }), "{few}: {error}");
+        }
+    }
+    let same = vec![random_pairs(1, 1)[0]; 50];
+    assert!(matches!(estimate(&same), Err(Error::NoPose { .. })));
+    let mut broken = random_pairs(20, 20);
+    broken[7].target.y = f64::NAN;
+    assert!(matches!(estimate(&broken), Err(Error::InvalidInput(_))));
 }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 
-use rare::Error;
 use rare::pose::{Mode, PoseEstimator};
 use rare_nets::outliers::pointdsc::{PointDsc, PointDscConfig, layout};
 
@@ -72,22 +71,7 @@ fn a_clear_case_is_solved_and_a_hopeless_one_refused() {
     let Some(parameters) = parameters("pointdsc_random.safetensors") else { return };
     for mode in [Mode::Faithful, Mode::Fixed] {
         let network = PointDsc::load(&parameters, PointDscConfig::three_d_match(mode)).unwrap();
-        let estimate = |pairs: &[Correspondence]| network.estimate(&no_cloud(), &no_cloud(), pairs);
-        let clear = estimate(&random_pairs(300, 200)).unwrap();
-        assert!((clear.target_from_source.to_matrix() - motion().to_matrix()).amax() < 1e-6);
-        assert!((0..200).all(|i| clear.inliers.contains(&i)));
-        assert!(clear.runner_up.is_none_or(|other| other <= clear.score));
-        assert!(matches!(estimate(&random_pairs(300, 0)), Err(Error::NoPose { .. })));
-        for few in 0..12 {
-            if let Err(error) = estimate(&random_pairs(few, few)) {
-                assert!(matches!(error, Error::NoPose { .. }), "{few}: {error}");
-            }
-        }
-        let same = vec![random_pairs(1, 1)[0]; 50];
-        assert!(matches!(estimate(&same), Err(Error::NoPose { .. })));
-        let mut broken = random_pairs(20, 20);
-        broken[7].target.y = f64::NAN;
-        assert!(matches!(estimate(&broken), Err(Error::InvalidInput(_))));
+        solves_the_clear_and_refuses_the_hopeless(&network);
     }
 }
 
