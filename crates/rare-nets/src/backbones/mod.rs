@@ -12,6 +12,7 @@
 //! | [`predator`] | Predator (Huang et al.: CVPR 2021) | RANSAC |
 
 pub mod cofinet;
+mod consensus;
 pub mod fcgf;
 pub mod geotransformer;
 mod hourglass;

@@ -6,7 +6,7 @@ use rare_nets::backbones::Selection;
 use rare_nets::backbones::fcgf::{Fcgf, FcgfConfig, layout};
 use rare_nets::checkpoint::Parameters;
 
-use super::formula::{official_layout, uniform, write_tensors};
+use super::formula::{official_layout, open_tensors, uniform};
 use crate::shared::{GoldenTensors, relative_difference};
 
 /// The largest relative difference of features.
@@ -39,11 +39,7 @@ pub(crate) fn weights(config: &FcgfConfig, leading: &[usize]) -> Parameters {
         (name.clone(), [leading, shape].concat(), values)
     };
     let tensors: Vec<_> = layout(config).iter().map(tensor).collect();
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("weights.safetensors");
-    write_tensors(&path, &tensors);
-    // The file stays open as long as the test needs it: the folder is left to the system.
-    Parameters::open(&folder.keep().join("weights.safetensors")).unwrap()
+    open_tensors(&tensors)
 }
 
 fn points(values: &[f64]) -> Vec<Point3<f64>> {
