@@ -129,6 +129,20 @@ impl Matrix {
         Matrix { rows: self.columns, columns: self.rows, values }
     }
 
+    /// Takes rows of `columns` numbers; what does not fill a row is left out.
+    pub(crate) fn from_rows(columns: usize, mut values: Vec<f32>) -> Matrix {
+        let rows = values.len().checked_div(columns).unwrap_or(0);
+        values.truncate(rows * columns);
+        Matrix { rows, columns, values }
+    }
+
+    /// So many columns from `first` on.
+    pub(crate) fn columns_from(&self, first: usize, columns: usize) -> Matrix {
+        let rows = self.values.chunks_exact(self.columns.max(1));
+        let values = rows.flat_map(|row| &row[first..first + columns]).copied().collect();
+        Matrix { rows: self.rows, columns, values }
+    }
+
     /// Adds another matrix, number by number.
     ///
     /// # Errors
@@ -163,6 +177,8 @@ mod tests {
         let beside = matrix.beside(&counting(3, 1)).unwrap();
         assert_eq!(beside.values(), [0.0, 1.0, 0.0, 2.0, 3.0, 1.0, 4.0, 5.0, 2.0]);
         assert_eq!(matrix.transposed().values(), [0.0, 2.0, 4.0, 1.0, 3.0, 5.0]);
+        assert_eq!(matrix.columns_from(1, 1).values(), [1.0, 3.0, 5.0]);
+        assert_eq!(Matrix::from_rows(2, vec![1.0; 5]).values(), [1.0; 4]);
     }
 
     #[test]

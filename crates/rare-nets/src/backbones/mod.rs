@@ -13,6 +13,7 @@
 
 mod backbone;
 pub mod cofinet;
+mod consensus;
 pub mod fcgf;
 pub(crate) mod fitted;
 pub mod geotransformer;

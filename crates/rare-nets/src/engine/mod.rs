@@ -14,6 +14,7 @@ mod attention;
 mod backend;
 mod convolution;
 mod cpu;
+mod curve;
 mod epilogue;
 mod factored_attention;
 mod math;
@@ -25,14 +26,17 @@ mod shared_output;
 mod simd;
 mod tensor;
 mod tile;
+mod transport;
 mod vectors;
 mod winograd;
 
 pub use backend::{Activation, Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
 pub use cpu::{CpuBackend, Precision};
+pub(crate) use curve::{Curve, MOST_ANGLES, PairEmbedding};
 pub(crate) use factored_attention::{
     Columns, FactorRows, Head, QUERIES as FACTORED_QUERIES, ScoreFactors,
 };
 pub use pack::PackedWeight;
 pub use simd::Processor;
 pub use tensor::Tensor;
+pub(crate) use transport::log_transport;

@@ -87,6 +87,20 @@ impl LocalToGlobal {
         pairs: &[Correspondence],
         groups: &[Vec<usize>],
     ) -> Result<PoseEstimate> {
+        let found = self.most_agreed(pairs, groups)?;
+        significance::require(&found.target_from_source, pairs, self.acceptance_radius)?;
+        Ok(found)
+    }
+
+    /// The same, however few correspondences agree: whether they mean anything is for the caller to judge.
+    ///
+    /// # Errors
+    /// As [`LocalToGlobal::estimate`], `NoPose` only if the pairs do not determine a pose.
+    pub fn most_agreed(
+        &self,
+        pairs: &[Correspondence],
+        groups: &[Vec<usize>],
+    ) -> Result<PoseEstimate> {
         self.validate(pairs, groups)?;
         let proposals = self.proposals(pairs, groups)?;
         let iterations = proposals.len();
@@ -99,7 +113,6 @@ impl LocalToGlobal {
             )));
         };
         let best = self.refined(*elected, pairs);
-        significance::require(&best.target_from_source, pairs, self.acceptance_radius)?;
         Ok(PoseEstimate {
             target_from_source: best.target_from_source,
             inliers: consensus::inliers(&best.target_from_source, pairs, self.acceptance_radius),

@@ -11,6 +11,7 @@
 
 mod coarse;
 mod config;
+mod describe;
 mod fine;
 mod layout;
 mod network;

@@ -2,10 +2,10 @@
 
 use rare::matching::{self, Match};
 use rare::nalgebra::Point3;
-use rare::pose::PoseEstimator;
-use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
+use rare::{PointFeatures, Result};
 
 use super::{Fcgf, FcgfConfig, Matching};
+use crate::backbones::consensus::{correspondences, for_target, pose};
 use crate::backbones::{Description, Keypoints, Selection, SelectionRule};
 
 impl Fcgf {
@@ -25,37 +25,28 @@ impl Fcgf {
         selection: &Selection,
     ) -> Result<Description> {
         let (from, to) = rayon::join(
-            || self.keypoints(source, selection, 0),
-            || self.keypoints(target, selection, 1),
+            || self.keypoints(source, selection),
+            || self.keypoints(target, &for_target(selection)),
         );
         let (from, to) = (from?, to?);
         let matches = self.config.matches(&from, &to)?;
-        let correspondences = self.config.correspondences(&from, &to, &matches);
-        let target_from_source = self.config.pose(source, target, &correspondences);
+        let pairs = correspondences(&from, &to, &matches, |pair| self.config.score(pair));
+        let target_from_source = pose(&self.config.ransac, [source, target], &pairs, selection);
         let [source, target] = [from, to].map(worth_the_same);
         Ok(Description {
             source,
             target,
-            correspondences,
+            correspondences: pairs,
             target_from_source,
             neighbour_limits: None,
             warnings: Vec::new(),
         })
     }
 
-    /// Random voxels of a cloud. `side` keeps the choices of two equal clouds apart.
-    fn keypoints(
-        &self,
-        points: &[Point3<f64>],
-        selection: &Selection,
-        side: u64,
-    ) -> Result<PointFeatures> {
+    /// Random voxels of a cloud.
+    fn keypoints(&self, points: &[Point3<f64>], selection: &Selection) -> Result<PointFeatures> {
         let output = self.run(points)?;
-        let chance = Selection {
-            rule: SelectionRule::Random,
-            seed: selection.seed.wrapping_add(side),
-            ..*selection
-        };
+        let chance = Selection { rule: SelectionRule::Random, ..*selection };
         let chosen = chance.choose(&vec![1.0; output.kept.len()]);
         let kept = output.kept.iter().filter_map(|&index| points.get(index)).copied().collect();
         let dimension = output.features.columns();
@@ -71,32 +62,9 @@ impl FcgfConfig {
         }
     }
 
-    /// The matched points, the highest score first.
-    fn correspondences(
-        &self,
-        source: &PointFeatures,
-        target: &PointFeatures,
-        matches: &[Match],
-    ) -> Vec<Correspondence> {
-        let mut pairs = matching::correspondences(source, target, matches, 1);
-        if !self.unit_features {
-            for (pair, found) in pairs.iter_mut().zip(matches) {
-                pair.score = 1.0 / (1.0 + found.squared_distance);
-            }
-        }
-        pairs.sort_by(|a, b| b.score.total_cmp(&a.score));
-        pairs
-    }
-
-    fn pose(
-        &self,
-        source: &[Point3<f64>],
-        target: &[Point3<f64>],
-        pairs: &[Correspondence],
-    ) -> Result<RigidTransform> {
-        let source = PointCloud::new(source.to_vec())?;
-        let target = PointCloud::new(target.to_vec())?;
-        Ok(self.ransac.estimate(&source, &target, pairs)?.target_from_source)
+    /// How much a pair is worth.
+    fn score(&self, pair: &Match) -> f64 {
+        if self.unit_features { pair.similarity(1) } else { 1.0 / (1.0 + pair.squared_distance) }
     }
 }
 

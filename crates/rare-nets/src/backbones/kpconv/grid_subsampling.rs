@@ -22,14 +22,20 @@ pub fn subsample(points: &[Point], voxel: f32) -> Result<Vec<Point>> {
     let (low, high) = bounds(points, voxel)?;
     let inverse = (1.0 / f64::from(voxel)) as f32;
     let origin = low.map(|coordinate| (coordinate * inverse).floor() * voxel);
-    let cell = |coordinate: f32, axis: usize| ((coordinate - origin[axis]) / voxel).floor() as u64;
-    let sizes = [0, 1].map(|axis| cell(high[axis], axis) + 1);
+    // The lowest point can end up below the origin by rounding, and then has a cell of its own, as in the released code.
+    let cell = |coordinate: f32, axis: usize| {
+        let steps = ((coordinate - origin[axis]) / voxel).floor();
+        (steps as i64).cast_unsigned()
+    };
+    let sizes = [0, 1].map(|axis| cell(high[axis], axis).wrapping_add(1));
     // The map is only asked, never iterated: its order cannot show.
     let mut slots = HashMap::<u64, usize>::with_capacity(points.len() / 2);
     let mut sums: Vec<(Point, u32)> = Vec::new();
     for point in points {
         let [x, y, z] = [0, 1, 2].map(|axis| cell(point[axis], axis));
-        let slot = *slots.entry(x + sizes[0] * (y + sizes[1] * z)).or_insert(sums.len());
+        let layer = y.wrapping_add(sizes[1].wrapping_mul(z));
+        let key = x.wrapping_add(sizes[0].wrapping_mul(layer));
+        let slot = *slots.entry(key).or_insert(sums.len());
         match sums.get_mut(slot) {
             Some((sum, count)) => {
                 sum.iter_mut().zip(point).for_each(|(sum, coordinate)| *sum += coordinate);

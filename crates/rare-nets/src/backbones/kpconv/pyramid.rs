@@ -105,6 +105,15 @@ pub struct Stage {
     pub upsampling: Vec<u32>,
 }
 
+impl Stage {
+    /// The points of either cloud.
+    #[must_use]
+    pub fn clouds(&self) -> [&[Point]; 2] {
+        let (first, second) = self.points.split_at(self.lengths[0].min(self.points.len()));
+        [first, second]
+    }
+}
+
 /// Two clouds at several resolutions, the finest first.
 #[derive(Debug, Clone)]
 pub struct Pyramid {

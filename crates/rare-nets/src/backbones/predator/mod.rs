@@ -9,6 +9,7 @@
 //! | description | `describe.rs` | two clouds -> keypoints, correspondences and a pose |
 
 mod config;
+mod describe;
 mod edge_convolution;
 mod layout;
 mod network;

@@ -1,11 +1,14 @@
 //! `CoFiNet` against recorded stages of the official code.
 
+use rare::RigidTransform;
+use rare::nalgebra::Point3;
 use rare_nets::Matrix;
+use rare_nets::backbones::Selection;
 use rare_nets::backbones::cofinet::{CoFiNet, CoFiNetConfig, Output, layout};
-use rare_nets::backbones::kpconv::PyramidConfig;
+use rare_nets::backbones::kpconv::{NeighbourLimits, PyramidConfig};
 
 use super::formula::official_layout;
-use super::recorded::{TOLERANCE, compare, compare_change, pyramid, weights};
+use super::recorded::{TOLERANCE, clouds, compare, compare_change, described, pyramid, weights};
 use crate::shared::{GoldenTensors, relative_difference};
 
 fn tiny() -> CoFiNetConfig {
@@ -126,4 +129,56 @@ fn tensors_are_those_of_the_official_model() {
     let Some(official) = official_layout("cofinet") else { return };
     assert!(layout(&CoFiNetConfig::three_d_match()) == official);
     assert!(layout(&CoFiNetConfig::kitti()) == official);
+}
+
+#[test]
+fn two_clouds_are_described_whatever_the_number_of_threads() {
+    let Some(golden) = GoldenTensors::open("backbones/cofinet_tiny.safetensors") else { return };
+    let Some(weights) = weights("cofinet_tiny") else { return };
+    let network = CoFiNet::load(&weights, tiny()).unwrap();
+    let [source, target] = clouds(&golden);
+    let limits = NeighbourLimits(vec![24; 4]);
+    let selection = Selection { count: 300, ..Selection::default() };
+    let description =
+        described(|| network.describe(&source, &target, &limits, &selection).unwrap());
+    assert_eq!(description.correspondences.len(), 300);
+    for (side, cloud) in [(&description.source, &source), (&description.target, &target)] {
+        assert_eq!(side.features.dimension(), 8);
+        assert!(side.features.len() <= 300 && side.scores.is_sorted_by(|a, b| a >= b));
+        let points = side.features.points();
+        assert!(points.iter().all(|point| cloud.contains(point)));
+        assert!((1..points.len()).all(|index| !points[..index].contains(&points[index])));
+    }
+    assert!(description.warnings.is_empty(), "{:?}", description.warnings);
+}
+
+#[test]
+fn a_cloud_lies_on_itself() {
+    let Some(golden) = GoldenTensors::open("backbones/cofinet_tiny.safetensors") else { return };
+    let Some(weights) = weights("cofinet_tiny") else { return };
+    let network = CoFiNet::load(&weights, tiny()).unwrap();
+    let [cloud, _] = clouds(&golden);
+    let limits = NeighbourLimits(vec![24; 4]);
+    let selection = Selection { count: 800, ..Selection::default() };
+    let description = network.describe(&cloud, &cloud, &limits, &selection).unwrap();
+    let error =
+        description.target_from_source.map(|pose| pose.error_to(&RigidTransform::identity()));
+    println!("cofinet, a cloud on itself: {error:?}");
+}
+
+#[test]
+fn clouds_of_few_points_have_few_pairs() {
+    let Some(weights) = weights("cofinet_tiny") else { return };
+    let config = CoFiNetConfig { most_pairs: 2, ..tiny() };
+    let network = CoFiNet::load(&weights, config).unwrap();
+    let (limits, selection) = (NeighbourLimits(vec![24; 4]), Selection::default());
+    let alone = [Point3::new(0.1, 0.2, 2.0)];
+    let wall: Vec<_> =
+        (0..64).map(|i| Point3::new(f64::from(i % 8), f64::from(i / 8), 9.0)).collect();
+    let wall: Vec<_> = wall.iter().map(|point| point * 0.1).collect();
+    let description = network.describe(&wall, &alone, &limits, &selection).unwrap();
+    assert!(description.target_from_source.is_err());
+    let description = network.describe(&wall, &wall, &limits, &selection).unwrap();
+    println!("{:?}", description.warnings);
+    assert!(network.describe(&[], &wall, &limits, &selection).is_err());
 }

@@ -1,9 +1,8 @@
 //! Weights that follow from their names, and lists of the tensors of official checkpoints.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
-use rare_nets::checkpoint::Layout;
+use rare_nets::checkpoint::{Layout, Parameters};
 
 use crate::shared;
 
@@ -23,8 +22,8 @@ pub(crate) fn uniform(name: &str, count: usize) -> Vec<f32> {
     (0..count as u64).map(number).collect()
 }
 
-/// Writes a safetensors file of `F32` tensors.
-pub(crate) fn write_tensors(path: &Path, tensors: &[(String, Vec<usize>, Vec<f32>)]) {
+/// Opens `F32` tensors as a file would give them. The file is left to the system: it is read when it is asked for.
+pub(crate) fn open_tensors(tensors: &[(String, Vec<usize>, Vec<f32>)]) -> Parameters {
     let mut header = BTreeMap::new();
     let mut data: Vec<u8> = Vec::new();
     for (name, shape, values) in tensors {
@@ -40,7 +39,9 @@ pub(crate) fn write_tensors(path: &Path, tensors: &[(String, Vec<usize>, Vec<f32
     let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
     bytes.extend(header);
     bytes.extend(data);
-    std::fs::write(path, bytes).unwrap();
+    let path = tempfile::tempdir().unwrap().keep().join("weights.safetensors");
+    std::fs::write(&path, bytes).unwrap();
+    Parameters::open(&path).unwrap()
 }
 
 /// The tensors of an official checkpoint: `golden/backbones/<name>.state_dict.txt`.

@@ -3,9 +3,14 @@
 use std::fs;
 
 use rare::nalgebra::Point3;
-use rare_nets::backbones::Selection;
-use rare_nets::backbones::fcgf;
+use rare_nets::backbones::cofinet::{self, CoFiNet, CoFiNetConfig};
+use rare_nets::backbones::fcgf::{Fcgf, FcgfConfig};
+use rare_nets::backbones::kpconv::NeighbourLimits;
+use rare_nets::backbones::predator::{self, Predator, PredatorConfig};
+use rare_nets::backbones::{Description, Selection};
+use rare_nets::checkpoint::{Layout, Parameters};
 
+use super::formula::{open_tensors, uniform};
 use crate::shared::GoldenTensors;
 
 /// CPU seconds of this process so far, and its largest resident memory, MB (Linux).
@@ -45,15 +50,72 @@ fn measured<T>(what: &str, work: impl FnOnce() -> T) -> T {
 #[ignore = "measures"]
 fn fcgf_on_rooms() {
     let Some([source, target]) = rooms() else { return };
-    let config = fcgf::FcgfConfig::three_d_match();
-    let network = fcgf::Fcgf::load(&super::fcgf::weights(&config, &[]), config).unwrap();
+    let config = FcgfConfig::three_d_match();
+    let network = Fcgf::load(&super::fcgf::weights(&config, &[]), config).unwrap();
     measured("fcgf: source alone", || network.run(&source).unwrap());
     let selection = Selection { count: 5000, ..Selection::default() };
     let description =
         measured("fcgf: pair", || network.describe(&source, &target, &selection).unwrap());
+    say(&description);
+}
+
+fn say(description: &Description) {
+    let keypoints = [&description.source, &description.target].map(|side| side.features.len());
     println!(
-        "{} correspondences, {:?}",
+        "{keypoints:?} keypoints, {} correspondences, pose: {}, {:?}",
         description.correspondences.len(),
-        description.target_from_source.is_ok()
+        description.target_from_source.is_ok(),
+        description.warnings
     );
+}
+
+/// Weights by the formula: uniform, as large as keeps the scale of activations; kernel points on a sphere.
+fn weights(layout: &Layout, kernel_radius: f32) -> Parameters {
+    let tensor = |(name, shape): (&String, &Vec<usize>)| {
+        let mut values = uniform(name, shape.iter().product());
+        let factor = match shape.as_slice() {
+            [_, inputs, _] if name.ends_with("KPConv.weights") => (3.0 / *inputs as f32).sqrt(),
+            [_, 3] => kernel_radius,
+            [_, inputs, ..] => (3.0 / *inputs as f32).sqrt(),
+            [] => 1.0,
+            _ => 0.1,
+        };
+        values.iter_mut().for_each(|value| *value *= factor);
+        if name.ends_with("kernel_points") {
+            for point in values.chunks_exact_mut(3) {
+                let norm = point.iter().map(|value| value * value).sum::<f32>().sqrt();
+                point.iter_mut().for_each(|value| *value *= 0.66 * kernel_radius / norm);
+            }
+        }
+        (name.clone(), shape.clone(), values)
+    };
+    open_tensors(&layout.iter().map(tensor).collect::<Vec<_>>())
+}
+
+#[test]
+#[ignore = "measures"]
+fn cofinet_on_rooms() {
+    let Some([source, target]) = rooms() else { return };
+    let config = CoFiNetConfig::three_d_match();
+    let network = CoFiNet::load(&weights(&cofinet::layout(&config), 0.0625), config).unwrap();
+    let (limits, selection) =
+        (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
+    let description = measured("cofinet: pair", || {
+        network.describe(&source, &target, &limits, &selection).unwrap()
+    });
+    say(&description);
+}
+
+#[test]
+#[ignore = "measures"]
+fn predator_on_rooms() {
+    let Some([source, target]) = rooms() else { return };
+    let config = PredatorConfig::three_d_match();
+    let network = Predator::load(&weights(&predator::layout(&config), 0.0625), config).unwrap();
+    let (limits, selection) =
+        (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
+    let description = measured("predator: pair", || {
+        network.describe(&source, &target, &limits, &selection).unwrap()
+    });
+    say(&description);
 }

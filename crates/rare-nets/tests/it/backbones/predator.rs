@@ -1,10 +1,13 @@
 //! Predator against recorded stages of the official code.
 
-use rare_nets::backbones::kpconv::PyramidConfig;
+use rare::RigidTransform;
+use rare::nalgebra::Point3;
+use rare_nets::backbones::Selection;
+use rare_nets::backbones::kpconv::{NeighbourLimits, PyramidConfig};
 use rare_nets::backbones::predator::{Predator, PredatorConfig, layout};
 
 use super::formula::official_layout;
-use super::recorded::{TOLERANCE, compare, compare_change, pyramid, weights};
+use super::recorded::{TOLERANCE, clouds, compare, compare_change, described, pyramid, weights};
 use crate::shared::{GoldenTensors, relative_difference};
 
 fn tiny() -> PredatorConfig {
@@ -51,4 +54,66 @@ fn tensors_are_those_of_the_official_models() {
     assert!(layout(&PredatorConfig::three_d_match()) == official);
     let Some(official) = official_layout("predator_kitti") else { return };
     assert!(layout(&PredatorConfig::kitti()) == official);
+}
+
+fn network() -> Option<Predator> {
+    let mut config = tiny();
+    config.ransac.inlier_threshold = 0.1;
+    Some(Predator::load(&weights("predator_tiny")?, config).unwrap())
+}
+
+#[test]
+fn two_clouds_are_described_whatever_the_number_of_threads() {
+    let Some(golden) = GoldenTensors::open("backbones/predator_tiny.safetensors") else { return };
+    let Some(network) = network() else { return };
+    let [source, target] = clouds(&golden);
+    let limits = NeighbourLimits(vec![24; 4]);
+    let selection = Selection { count: 300, ..Selection::default() };
+    let description =
+        described(|| network.describe(&source, &target, &limits, &selection).unwrap());
+    for (side, cloud) in [(&description.source, &source), (&description.target, &target)] {
+        assert_eq!((side.features.len(), side.features.dimension()), (300, 32));
+        assert!(side.scores.is_sorted_by(|a, b| a >= b) && side.scores[0] <= 1.0);
+        assert!(side.features.points().iter().all(|point| cloud.contains(point)));
+    }
+    assert_eq!(description.correspondences.len(), 300);
+    assert!(description.warnings.is_empty(), "{:?}", description.warnings);
+}
+
+#[test]
+fn a_cloud_lies_on_itself() {
+    let Some(golden) = GoldenTensors::open("backbones/predator_tiny.safetensors") else { return };
+    let Some(network) = network() else { return };
+    let [cloud, _] = clouds(&golden);
+    let limits = NeighbourLimits(vec![24; 4]);
+    let selection = Selection { count: 800, ..Selection::default() };
+    let description = network.describe(&cloud, &cloud, &limits, &selection).unwrap();
+    let error = description.target_from_source.unwrap().error_to(&RigidTransform::identity());
+    println!("predator, a cloud on itself: {error:?}");
+}
+
+#[test]
+fn small_clouds_are_described_with_a_warning_and_single_points_refused() {
+    let Some(network) = network() else { return };
+    let (limits, selection) = (NeighbourLimits(vec![24; 4]), Selection::default());
+    let wall = |width: usize| -> Vec<Point3<f64>> {
+        let place = |index: usize| [index % width, index / width].map(|step| step as f64 * 0.1);
+        (0..width * width).map(place).map(|[x, y]| Point3::new(x, y, 2.0 + 0.1 * x * y)).collect()
+    };
+    let small = wall(16);
+    let description = network.describe(&small, &small, &limits, &selection).unwrap();
+    assert!(
+        description.warnings[0].contains("nearest coarse points"),
+        "{:?}",
+        description.warnings
+    );
+    let refused = |cloud: &[Point3<f64>]| {
+        network.describe(&small, cloud, &limits, &selection).unwrap_err().to_string()
+    };
+    assert!(refused(&wall(1)).contains("at least 2 coarse points"));
+    assert!(refused(&[]).contains("0 points"));
+    assert!(refused(&[Point3::new(0.0, f64::NAN, 0.0)]).contains("NaN"));
+    let sparse: Vec<_> = small.iter().map(|point| point * 30.0).collect();
+    let description = network.describe(&small, &sparse, &limits, &selection);
+    println!("{:?}", description.map(|description| description.warnings));
 }

@@ -1,6 +1,8 @@
 //! Recorded pairs of clouds and stages of networks on them.
 
+use rare::nalgebra::Point3;
 use rare_nets::Matrix;
+use rare_nets::backbones::Description;
 use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid, PyramidConfig};
 use rare_nets::checkpoint::Parameters;
 
@@ -21,6 +23,28 @@ pub(crate) fn weights(name: &str) -> Option<Parameters> {
 pub(crate) fn pyramid(golden: &GoldenTensors, config: &PyramidConfig) -> Pyramid {
     let limits = NeighbourLimits(vec![24; config.stages]);
     golden_pyramid(golden, config, &limits)
+}
+
+/// The recorded source and target, metres.
+pub(crate) fn clouds(golden: &GoldenTensors) -> [Vec<Point3<f64>>; 2] {
+    let values = golden.array("in.points.0").values;
+    let points: Vec<_> = values.chunks_exact(3).map(|p| Point3::new(p[0], p[1], p[2])).collect();
+    let (first, second) = points.split_at(golden.array("in.lengths.0").usize()[0]);
+    [first.to_vec(), second.to_vec()]
+}
+
+/// Describes clouds in pools of 1 and of 3 threads, and makes sure that both say the same.
+pub(crate) fn described(describe: impl Fn() -> Description + Sync) -> Description {
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(&describe)
+    };
+    let (one, three) = (with(1), with(3));
+    assert!(one.source == three.source && one.target == three.target);
+    assert!(one.correspondences == three.correspondences);
+    assert!(one.target_from_source.as_ref().ok() == three.target_from_source.as_ref().ok());
+    assert!(one.correspondences.is_sorted_by(|a, b| a.score >= b.score));
+    one
 }
 
 /// Compares features with a recorded array, whose rows may be the channels of sequences.

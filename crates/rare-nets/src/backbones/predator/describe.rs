@@ -1,0 +1,79 @@
+//! Keypoints, correspondences and a pose of two clouds.
+
+use rare::nalgebra::Point3;
+use rare::{PointFeatures, Result, matching};
+
+use super::{Output, Predator};
+use crate::backbones::consensus::{correspondences, for_target, pose};
+use crate::backbones::hourglass::Prepared;
+use crate::backbones::kpconv::NeighbourLimits;
+use crate::backbones::{Description, Keypoints, Selection};
+
+impl Predator {
+    /// Describes two clouds: `selection.count` keypoints of each by the product of overlap and saliency, for each source
+    /// keypoint the target keypoint with the nearest feature, and the pose that RANSAC finds in these pairs, whose scores
+    /// are the cosines of their features. (The paper's tables take 250 to 5000 random keypoints, its demo 1000.)
+    ///
+    /// Points and results are in the local frames of the clouds, metres. Clouds that are denser than the voxels of the
+    /// model are thinned first. `limits` are the most neighbours of a point in each stage.
+    ///
+    /// # Errors
+    /// `InvalidInput` if a cloud is empty, not finite, too large for the voxels or too small for the coarse stage, or the
+    /// limits do not fit.
+    pub fn describe(
+        &self,
+        source: &[Point3<f64>],
+        target: &[Point3<f64>],
+        limits: &NeighbourLimits,
+        selection: &Selection,
+    ) -> Result<Description> {
+        let network = format!("Predator for {}", self.config.name);
+        let prepared = Prepared::new([source, target], &self.config.pyramid, limits, &network)?;
+        let output = self.run(&prepared.pyramid)?;
+        let [of_source, of_target] = prepared.points();
+        let second = of_source.len();
+        let from = keypoints(&output, of_source, 0, selection)?;
+        let to = keypoints(&output, of_target, second, &for_target(selection))?;
+        let matches = matching::nearest(&from.features, &to.features, None)?;
+        let pairs =
+            correspondences(&from.features, &to.features, &matches, |pair| pair.similarity(1));
+        let target_from_source = pose(&self.config.ransac, [source, target], &pairs, selection);
+        let mut warnings = prepared.warnings;
+        warnings.extend(self.small_graphs(output.degrees));
+        Ok(Description {
+            source: from,
+            target: to,
+            correspondences: pairs,
+            target_from_source,
+            warnings,
+        })
+    }
+
+    /// A remark if a cloud has fewer coarse points than the graph wants.
+    fn small_graphs(&self, degrees: [usize; 2]) -> Option<String> {
+        let [source, target] = degrees.map(|degree| degree + 1);
+        let wanted = self.config.neighbours;
+        (degrees.into_iter().any(|degree| degree < wanted)).then(|| {
+            format!(
+                "Predator looks at the {wanted} nearest coarse points of each, and these clouds have but {source} and \
+                 {target} or more: it looks at all of them, which it was not trained for"
+            )
+        })
+    }
+}
+
+/// The best points of a cloud, whose rows begin at `first`, with the product of both scores.
+fn keypoints(
+    output: &Output,
+    points: Vec<Point3<f64>>,
+    first: usize,
+    selection: &Selection,
+) -> Result<Keypoints> {
+    let scores = output.overlap.iter().zip(&output.saliency).skip(first).take(points.len());
+    let scores: Vec<f32> = scores.map(|(overlap, saliency)| overlap * saliency).collect();
+    let chosen = selection.choose(&scores);
+    let features = output.features.part(first, points.len());
+    let dimension = features.columns();
+    let features = PointFeatures::new(points, dimension, features.into_values())?.select(&chosen);
+    Ok(Keypoints { features, scores: chosen.iter().map(|&index| scores[index]).collect() })
+}
