@@ -2,8 +2,11 @@
 
 use rare::{Error, PointCloud, Result};
 
-use super::fcgf::{self, Fcgf};
-use super::{Description, Request};
+use super::cofinet::CoFiNet;
+use super::fcgf::{Fcgf, FcgfConfig};
+use super::kpconv::{NeighbourLimits, PyramidConfig};
+use super::predator::Predator;
+use super::{Description, Request, fitted};
 use crate::checkpoint::Parameters;
 use crate::networks::{Network, TrainedOn};
 
@@ -14,6 +17,8 @@ pub struct Backbone {
 }
 
 enum Loaded {
+    Predator(Box<Predator>),
+    CoFiNet(Box<CoFiNet>),
     Fcgf(Box<Fcgf>),
 }
 
@@ -24,15 +29,25 @@ impl Backbone {
     /// `InvalidInput` if the weights are of another network, or damaged; `Internal` if the network is none that
     /// describes clouds.
     pub fn load(network: Network, parameters: &Parameters) -> Result<Backbone> {
-        let (loaded, trained_on) = match network {
+        let (loaded, voxel) = match network {
+            Network::Predator => {
+                let config = fitted::predator(parameters)?;
+                let voxel = config.pyramid.voxel;
+                (Loaded::Predator(Box::new(Predator::load(parameters, config)?)), voxel)
+            }
+            Network::CoFiNet => {
+                let config = fitted::cofinet(parameters)?;
+                let voxel = config.pyramid.voxel;
+                (Loaded::CoFiNet(Box::new(CoFiNet::load(parameters, config)?)), voxel)
+            }
             Network::Fcgf => {
-                let config = fcgf::FcgfConfig::of(parameters);
-                let trained_on = TrainedOn::from_voxel(config.voxel);
-                (Loaded::Fcgf(Box::new(Fcgf::load(parameters, config)?)), trained_on)
+                let config = FcgfConfig::of(parameters);
+                let voxel = config.voxel;
+                (Loaded::Fcgf(Box::new(Fcgf::load(parameters, config)?)), voxel)
             }
             network => return Err(Error::Internal(format!("{network} describes no clouds"))),
         };
-        Ok(Backbone { loaded, trained_on })
+        Ok(Backbone { loaded, trained_on: TrainedOn::from_voxel(voxel) })
     }
 
     /// What the weights were trained on.
@@ -52,9 +67,13 @@ impl Backbone {
         target: &PointCloud,
         request: &Request,
     ) -> Result<Description> {
-        let points = [source.points(), target.points()];
+        let [from, to] = [source.points(), target.points()];
+        let selection = &request.selection;
+        let limits = NeighbourLimits::three_d_match();
         let description = match &self.loaded {
-            Loaded::Fcgf(network) => network.describe(points[0], points[1], &request.selection),
+            Loaded::Predator(network) => network.describe(from, to, &limits, selection),
+            Loaded::CoFiNet(network) => network.describe(from, to, &limits, selection),
+            Loaded::Fcgf(network) => network.describe(from, to, selection),
         }?;
         Ok(description.into_world(source, target))
     }

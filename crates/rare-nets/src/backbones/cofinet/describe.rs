@@ -53,6 +53,7 @@ impl CoFiNet {
             target: keypoints(&output, of_target, second, to)?,
             correspondences,
             target_from_source,
+            neighbour_limits: Some(limits.0.clone()),
             warnings,
         })
     }

@@ -45,6 +45,7 @@ impl Predator {
             target: to,
             correspondences: pairs,
             target_from_source,
+            neighbour_limits: Some(limits.0.clone()),
             warnings,
         })
     }
