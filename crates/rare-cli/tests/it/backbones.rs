@@ -17,7 +17,7 @@ const BACKBONES: [(&str, &str); 3] = [
 ];
 
 /// Copies the weights of a recorded network under their official names.
-fn weights(workplace: &Workplace, golden: &str) -> Option<String> {
+pub(crate) fn weights(workplace: &Workplace, golden: &str) -> Option<String> {
     let path = shared_path(&format!("golden/backbones/{golden}.weights.safetensors"))?;
     let tensors = Tensors::read(&fs::read(path).unwrap());
     let name = format!("{golden}.safetensors");
@@ -27,7 +27,7 @@ fn weights(workplace: &Workplace, golden: &str) -> Option<String> {
 }
 
 /// The weights of a recorded filter.
-fn filter(name: &str) -> Option<PathBuf> {
+pub(crate) fn filter(name: &str) -> Option<PathBuf> {
     shared_path(&format!("golden/estimators/{name}_random.safetensors"))
 }
 

@@ -10,6 +10,7 @@ use rare::nalgebra::{Rotation3, Vector3};
 use rare::random::Random;
 use serde_json::{Value, json};
 
+use crate::backbones::{filter as filter_weights, weights as network_weights};
 use crate::pickle_writer::Pickle;
 use crate::shared::{Workplace, argument, pair, shifted, start};
 
@@ -311,10 +312,11 @@ fn the_papers_tables_are_filled_as_far_as_the_data_goes() {
     assert_eq!(cells(3, "GeoTransformer"), ["100.0", "0.00", "0.000"]);
     assert_eq!(cells(6, "w/o Inlier Aggregation").len(), 3);
     for (number, name, why) in [
-        (1, "PointDSC", "trained weights"),
+        (1, "PointDSC", "no --weights of PointDSC for 3DMatch"),
         (1, "SC2-PCR++", "no transform"),
         (2, "Ours", "3DLoMatch"),
         (3, "FCGF", "features/fcgf/3DMatch"),
+        (3, "Predator + Ours", "no --weights of Predator for 3DMatch"),
         (4, "Ours", "08.txt"),
         (5, "0, 3, 6", "diffusion weights"),
     ] {
@@ -436,4 +438,48 @@ fn an_evaluation_is_shown_with_all_its_pairs() {
         let all = [&["eval", kind, "room", "--out", "other", "--report"], refused].concat();
         workplace.run(&all).assert_refused(&["--report"]);
     }
+}
+
+#[test]
+fn networks_are_evaluated_beside_other_methods() {
+    let workplace = benchmark();
+    let Some(predator) = network_weights(&workplace, "predator_tiny") else { return };
+    let Some(pointdsc) = filter_weights("pointdsc") else { return };
+    let evaluation = ["eval", "folder", "room", "--out", "out", "--limit", "2", "-q"];
+    let networks = ["--backbone", "predator", "--weights", &predator, "--weights"];
+    let methods = ["--methods", "init,ransac-50k,sc2-pcr++,pointdsc,refine"];
+    let arguments = [&evaluation[..], &networks, &[argument(&pointdsc)], &methods].concat();
+    let outcome = workplace.run(&arguments);
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    let lines = lines(&workplace, "out");
+    assert_eq!(lines.len(), 10, "{lines:?}");
+    let settings = workplace.json("out/benchmark.json")["settings"].clone();
+    assert_eq!(settings["start"], "described", "{settings}");
+    assert_eq!(settings["backbone"]["network"], "predator");
+    // The features of a network can also be refined from transforms that came from elsewhere.
+    let given = ["--init", "init.json", "--methods", "refine"];
+    let backbone = ["--backbone", "predator", "--weights", &predator];
+    let evaluation = ["eval", "folder", "room", "--out", "given", "--limit", "1", "-q"];
+    let outcome = workplace.run(&[&evaluation[..], &given, &backbone].concat());
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    let line = &self::lines(&workplace, "given")[0];
+    assert!(line["target_from_source"].is_array(), "{line}");
+    let missing = ["eval", "folder", "room", "--out", "none", "--methods", "vbreg"];
+    workplace.run(&missing).assert_refused(&["vbreg", "VBReg", "--weights"]);
+}
+
+#[test]
+fn weights_fill_rows_of_the_papers_tables() {
+    let workplace = three_d_match();
+    let Some(predator) = network_weights(&workplace, "predator_tiny") else { return };
+    let Some(pointdsc) = filter_weights("pointdsc") else { return };
+    let weights = ["--weights", &predator, "--weights", argument(&pointdsc)];
+    let outcome =
+        workplace.run(&[&["eval", "paper", "data", "--out", "out", "-q"][..], &weights].concat());
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    let text = workplace.text("out/paper.txt");
+    assert!(!text.contains("PointDSC: not run: no --weights of PointDSC for 3DMatch"), "{text}");
+    assert!(!text.contains("no --weights of Predator for 3DMatch"), "{text}");
+    assert!(text.contains("no --weights of FCGF for 3DMatch"), "{text}");
+    assert!(workplace.path("out/3DMatch-predator/results.jsonl").is_file());
 }
