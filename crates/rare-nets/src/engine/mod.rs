@@ -31,7 +31,7 @@ mod winograd;
 pub use backend::{Activation, Arrangement, Backend, Convolution, Kernel, Prologue, Shape};
 pub use cpu::{CpuBackend, Precision};
 pub(crate) use factored_attention::{
-    Columns, FactorRows, Head, QUERIES as FACTORED_QUERIES, ScoreFactors,
+    AlignedRows, Columns, FactorRows, Head, QUERIES as FACTORED_QUERIES, ScoreFactors,
 };
 pub use pack::PackedWeight;
 pub use simd::Processor;
