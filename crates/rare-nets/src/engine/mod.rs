@@ -7,7 +7,8 @@
 //!
 //! [`CpuBackend`] is the only one so far. From the outside in: `convolution` and `attention` cut the work into pieces
 //! for the threads, `operand` and `pack` put both sides of the product in order, `tile` multiplies them in registers,
-//! `simd` has the instructions of each processor. All unsafe code of the workspace is in this folder.
+//! `simd` has the instructions of each processor. `factored_attention` and `recurrent` are for networks on points, which
+//! have no other backend. All unsafe code of the workspace is in this folder.
 
 mod arena;
 mod attention;
