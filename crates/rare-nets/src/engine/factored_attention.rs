@@ -9,11 +9,6 @@
 //! which is exact, and costs what the listed keys cost. Where nearly all keys are listed, the two sums could cancel:
 //! whoever lists the keys then lists all of them, and the first sum falls away.
 
-#![expect(
-    clippy::needless_range_loop,
-    reason = "iterators would move the vectors out of their registers"
-)]
-
 mod rows;
 mod softmax;
 

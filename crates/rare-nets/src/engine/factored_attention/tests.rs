@@ -5,6 +5,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::super::arena::Arena;
+use super::rows::KEYS;
 use super::*;
 
 fn aligned(source: Columns<'_>, columns: usize) -> AlignedRows {
