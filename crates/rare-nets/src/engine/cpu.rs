@@ -9,7 +9,7 @@ use super::arena::Arena;
 use super::attention::{self, Keys};
 use super::backend::{Backend, Convolution, Kernel, Shape};
 use super::convolution::{self, Context};
-use super::factored_attention::{self, Head, ScoreFactors};
+use super::factored_attention::{self, AlignedRows, Columns, FactorRows, Head, ScoreFactors};
 use super::pack::{self, PackedWeight};
 use super::recurrent::GatedUpdate;
 use super::simd::Processor;
@@ -86,6 +86,27 @@ impl CpuBackend {
         factors: &impl ScoreFactors,
     ) -> Result<Matrix> {
         factored_attention::attend(self.processor, head, factors)
+    }
+
+    /// Copies so many columns for [`Head`] and [`CpuBackend::listed_products`].
+    ///
+    /// # Errors
+    /// `Internal` if there are not so many or their number is no multiple of 16.
+    pub(crate) fn aligned(&self, source: Columns<'_>, columns: usize) -> Result<AlignedRows> {
+        AlignedRows::copy(&self.arena, source, columns)
+    }
+
+    /// The inner products of each query with the keys that are listed for it, one after the other; factors do not count.
+    ///
+    /// # Errors
+    /// `Internal` if the sizes do not fit; rows must have 16, 32, 64 or 128 numbers.
+    pub(crate) fn listed_products(
+        &self,
+        queries: Columns<'_>,
+        keys: &AlignedRows,
+        rows: &FactorRows,
+    ) -> Result<Vec<f32>> {
+        factored_attention::products(self.processor, queries, keys, rows)
     }
 
     /// One step of a gated recurrent unit (Cho et al., 2014) for each row of `states`, from `input = W_i u + b_i` and

@@ -7,7 +7,8 @@
 //!
 //! [`CpuBackend`] is the only one so far. From the outside in: `convolution` and `attention` cut the work into pieces
 //! for the threads, `operand` and `pack` put both sides of the product in order, `tile` multiplies them in registers,
-//! `simd` has the instructions of each processor. All unsafe code of the workspace is in this folder.
+//! `simd` has the instructions of each processor. `factored_attention` and `recurrent` are for networks on points, which
+//! have no other backend. All unsafe code of the workspace is in this folder.
 
 mod arena;
 mod attention;
@@ -34,7 +35,7 @@ pub use backend::{Activation, Arrangement, Backend, Convolution, Kernel, Prologu
 pub use cpu::{CpuBackend, Precision};
 pub(crate) use curve::{Curve, MOST_ANGLES, PairEmbedding};
 pub(crate) use factored_attention::{
-    Columns, FactorRows, Head, QUERIES as FACTORED_QUERIES, ScoreFactors,
+    AlignedRows, Columns, FactorRows, Head, QUERIES as FACTORED_QUERIES, ScoreFactors,
 };
 pub use pack::PackedWeight;
 pub use simd::Processor;

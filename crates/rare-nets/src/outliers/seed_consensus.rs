@@ -82,7 +82,7 @@ impl SeedConsensus {
         let mut matrix = vec![0.0; size * size];
         for (a, &i) in members.iter().enumerate() {
             for (b, &j) in members[..a].iter().enumerate() {
-                let likeness = similarity(features.row(i), features.row(j), sigma).max(0.0);
+                let likeness = similarity(dot(features.row(i), features.row(j)), sigma).max(0.0);
                 let value = f64::from(likeness * compatibilities.between(i, j));
                 matrix[a * size + b] = value;
                 matrix[b * size + a] = value;
@@ -124,9 +124,9 @@ impl SeedConsensus {
     }
 }
 
-/// `1 - (1 - a . b) / sigma^2` of two features of unit length.
-pub(crate) fn similarity(a: &[f32], b: &[f32], sigma: f32) -> f32 {
-    1.0 - (1.0 - dot(a, b)) / (sigma * sigma)
+/// `1 - (1 - a . b) / sigma^2` of the inner product `a . b` of two features of unit length.
+pub(crate) fn similarity(product: f32, sigma: f32) -> f32 {
+    1.0 - (1.0 - product) / (sigma * sigma)
 }
 
 /// The inner product, summed up in sixteen parts.

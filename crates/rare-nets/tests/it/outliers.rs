@@ -119,4 +119,9 @@ fn solves_the_clear_and_refuses_the_hopeless(network: &dyn PoseEstimator) {
     let mut broken = random_pairs(20, 20);
     broken[7].target.y = f64::NAN;
     assert!(matches!(estimate(&broken), Err(Error::InvalidInput(_))));
+    let far = random_pairs(20, 20).into_iter().map(|pair| {
+        let [source, target] = [pair.source, pair.target].map(|point| point * 1e300);
+        Correspondence { source, target, ..pair }
+    });
+    assert!(estimate(&far.collect::<Vec<_>>()).is_err());
 }

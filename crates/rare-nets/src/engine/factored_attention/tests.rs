@@ -1,6 +1,16 @@
 //! Against the definition in double precision, on every processor.
 
+use std::borrow::Cow;
+use std::ops::Range;
+use std::sync::Arc;
+
+use super::super::arena::Arena;
+use super::rows::KEYS;
 use super::*;
+
+fn aligned(source: Columns<'_>, columns: usize) -> AlignedRows {
+    AlignedRows::copy(&Arc::new(Arena::default()), source, columns).unwrap()
+}
 
 /// Factors as a whole matrix; rows with `all` list every key.
 struct Given {
@@ -38,22 +48,20 @@ fn numbers(rows: usize, columns: usize, scale: f32, seed: u64) -> Matrix {
 }
 
 fn expected(head: &Head<'_>, given: &Given, query: usize) -> Vec<f64> {
-    let row = |columns: Columns<'_>, row: usize| {
-        let row = &columns.matrix.row(row)[columns.first..columns.first + head.channels];
-        row.iter().map(|&value| f64::from(value)).collect::<Vec<f64>>()
-    };
-    let asked = row(head.queries, query);
+    let wide = |row: &[f32]| row.iter().map(|&value| f64::from(value)).collect::<Vec<f64>>();
+    let channels = head.keys.columns();
+    let asked = wide(&head.queries.matrix.row(query)[head.queries.first..][..channels]);
     let score = |key: usize| {
-        let product: f64 = asked.iter().zip(row(head.keys, key)).map(|(a, b)| a * b).sum();
-        f64::from(given.factors[query * given.keys + key]) * product / (head.channels as f64).sqrt()
+        let product: f64 = asked.iter().zip(wide(head.keys.row(key))).map(|(a, b)| a * b).sum();
+        f64::from(given.factors[query * given.keys + key]) * product / (channels as f64).sqrt()
     };
     let scores: Vec<f64> = (0..given.keys).map(score).collect();
     let largest = scores.iter().copied().fold(f64::MIN, f64::max);
     let weights: Vec<f64> = scores.iter().map(|score| (score - largest).exp()).collect();
     let sum: f64 = weights.iter().sum();
-    let mut mean = vec![0.0; head.channels];
+    let mut mean = vec![0.0; channels];
     for (key, weight) in weights.iter().enumerate() {
-        let values = row(head.values, key);
+        let values = wide(head.values.row(key));
         mean.iter_mut().zip(values).for_each(|(mean, value)| *mean += weight / sum * value);
     }
     mean
@@ -66,9 +74,8 @@ fn error(channels: usize, given: &Given, scale: f32) -> f64 {
     let other = numbers(given.keys, 2 * channels, scale, 2);
     let head = Head {
         queries: Columns { matrix: &together, first: channels },
-        keys: Columns { matrix: &other, first: 0 },
-        values: Columns { matrix: &other, first: channels },
-        channels,
+        keys: &aligned(Columns::all(&other), channels),
+        values: &aligned(Columns { matrix: &other, first: channels }, channels),
     };
     let mut largest: f64 = 0.0;
     for processor in Processor::available() {
@@ -106,14 +113,9 @@ fn scores_far_below_zero_lose_nothing_where_all_keys_are_listed() {
         row[..16].fill(-20.0);
         row[16..32].iter_mut().for_each(|value| *value = 20.0 + 0.01 * *value);
     }
-    let columns = |first| Columns { matrix: &head_of, first };
+    let columns = |first| aligned(Columns { matrix: &head_of, first }, 16);
     let asked = head_of.part(0, 1);
-    let head = Head {
-        queries: Columns { matrix: &asked, first: 0 },
-        keys: columns(16),
-        values: columns(32),
-        channels: 16,
-    };
+    let head = Head { queries: Columns::all(&asked), keys: &columns(16), values: &columns(32) };
     for processor in Processor::available() {
         let found = attend(processor, &head, &given).unwrap();
         for (found, expected) in found.values().iter().zip(expected(&head, &given, 0)) {
@@ -124,13 +126,39 @@ fn scores_far_below_zero_lose_nothing_where_all_keys_are_listed() {
 }
 
 #[test]
+fn products_are_those_of_the_listed_rows() {
+    let given = Given::new(7, 50, 0.3, false);
+    let (queries, keys) = (numbers(7, 40, 1.0, 1), numbers(50, 32, 1.0, 2));
+    let queries = Columns { matrix: &queries, first: 8 };
+    let rows = given.rows(0..7);
+    for processor in Processor::available() {
+        let keys = aligned(Columns::all(&keys), 32);
+        let products = products(processor, queries, &keys, &rows).unwrap();
+        assert_eq!(products.len(), rows.listed());
+        for query in 0..7 {
+            let found = &products[rows.range(query)];
+            for (&key, &found) in rows.row(query).0.iter().zip(found) {
+                let asked = &queries.matrix.row(query)[8..];
+                let expected: f32 =
+                    asked.iter().zip(keys.row(key as usize)).map(|(a, b)| a * b).sum();
+                assert!((found - expected).abs() < 1e-5, "{found} {expected}");
+            }
+        }
+    }
+}
+
+#[test]
 fn what_does_not_fit_is_refused() {
     let matrix = numbers(5, 48, 1.0, 1);
     let processor = Processor::detect().unwrap();
     let attended = |first, channels, given: &Given| {
         let columns = Columns { matrix: &matrix, first };
-        let head = Head { queries: columns, keys: columns, values: columns, channels };
-        attend(processor, &head, given).is_ok()
+        let Ok(rows) = AlignedRows::copy(&Arc::default(), columns, channels) else { return false };
+        let head = Head { queries: columns, keys: &rows, values: &rows };
+        let products = products(processor, columns, &rows, &given.rows(0..5));
+        let attended = attend(processor, &head, given);
+        assert_eq!(products.is_ok(), attended.is_ok());
+        attended.is_ok()
     };
     let given = Given::new(5, 5, 0.5, false);
     assert!(attended(32, 16, &given));

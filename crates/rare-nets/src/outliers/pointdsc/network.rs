@@ -119,7 +119,9 @@ impl Layer {
         Activation::Relu.apply_to(features.values_mut());
         let projected = self.projection.apply(cpu, &features)?;
         let third = |part: usize| Columns { matrix: &projected, first: part * CHANNELS };
-        let head = Head { queries: third(0), keys: third(1), values: third(2), channels: CHANNELS };
+        let keys = &cpu.aligned(third(1), CHANNELS)?;
+        let values = &cpu.aligned(third(2), CHANNELS)?;
+        let head = Head { queries: third(0), keys, values };
         self.message.add(cpu, &head, compatibilities, &mut features)?;
         Ok(features)
     }

@@ -20,8 +20,12 @@ use super::seed_consensus::SeedConsensus;
 use crate::Matrix;
 use crate::checkpoint::Parameters;
 use crate::engine::{CpuBackend, Precision};
-use network::{Encoded, Network};
+use crate::layers::unit_rows;
+use network::{Encoded, Network, Record};
 use voting::Votes;
+
+/// Seeds whose votes are counted together.
+const SEEDS: usize = 32;
 
 /// The settings of VBReg. The widths of the compatibilities are parameters of the network.
 ///
@@ -101,28 +105,24 @@ impl Vbreg {
     /// # Errors
     /// `NoPose` if there are fewer than three pairs; `InvalidInput` if one is not finite.
     pub fn encode(&self, pairs: &[Correspondence]) -> Result<VbregEncoding> {
-        let (encoded, compatibilities) = self.encoded(pairs)?;
+        let (Encoded { features, confidences, records }, compatibilities) = self.encoded(pairs)?;
         let consensus_of = &self.config.consensus;
-        let Encoded { features, confidences, records } = encoded;
         let seeds = consensus_of.seeds(pairs, &confidences);
-        let mode = consensus_of.choice.mode;
-        let votes = Votes {
-            compatibilities: &compatibilities,
-            records: &records,
-            pairs: pairs.len(),
-            mode,
-        };
+        let votes = self.votes(pairs, &records, &compatibilities);
         let count = consensus_of.around(pairs.len());
-        let last = records.last().ok_or_else(|| Error::Internal("no layers".to_owned()))?;
-        let (consensus, poses) = (seeds.par_iter())
-            .map(|&seed| {
-                let members = votes.consensus(seed, count);
-                let sigma = self.network.sigma;
-                let pose =
-                    consensus_of.pose(pairs, &members, &compatibilities, &last.features, sigma);
-                (members, pose.map(|pose| (pose, self.fitness(&pose, pairs))))
+        let consensus: Vec<Vec<Vec<usize>>> = (seeds.par_chunks(SEEDS))
+            .map(|seeds| votes.consensus(seeds, count))
+            .collect::<Result<_>>()?;
+        let consensus = consensus.concat();
+        let mut unit = features.clone();
+        unit_rows(&mut unit);
+        let sigma = self.network.sigma;
+        let poses = (consensus.par_iter())
+            .map(|members| {
+                let pose = consensus_of.pose(pairs, members, &compatibilities, &unit, sigma)?;
+                Some((pose, self.fitness(&pose, pairs)))
             })
-            .unzip();
+            .collect();
         Ok(VbregEncoding { features, confidences, seeds, consensus, poses })
     }
 
@@ -142,13 +142,7 @@ impl Vbreg {
             .get(layer)
             .filter(|_| rows.iter().all(|&row| row < pairs.len()))
             .ok_or_else(|| Error::invalid(format!("no layer {layer} or no rows {rows:?}")))?;
-        let mode = self.config.consensus.choice.mode;
-        let votes = Votes {
-            compatibilities: &compatibilities,
-            records: &records,
-            pairs: pairs.len(),
-            mode,
-        };
+        let votes = self.votes(pairs, &records, &compatibilities);
         Ok(rows.iter().map(|&row| votes.attention(record, row)).collect())
     }
 
@@ -157,6 +151,16 @@ impl Vbreg {
         let compatibilities = Compatibilities::new(pairs, self.network.spatial_sigma);
         let encoded = self.network.encode(pairs, &compatibilities, self.config.noise)?;
         Ok((encoded, compatibilities))
+    }
+
+    fn votes<'a>(
+        &'a self,
+        pairs: &[Correspondence],
+        records: &'a [Record],
+        compatibilities: &'a Compatibilities,
+    ) -> Votes<'a> {
+        let (cpu, mode) = (&self.network.cpu, self.config.consensus.choice.mode);
+        Votes { cpu, compatibilities, records, pairs: pairs.len(), mode }
     }
 
     fn fitness(&self, pose: &RigidTransform, pairs: &[Correspondence]) -> f64 {

@@ -11,7 +11,7 @@ use super::super::encoder::{
 use super::beliefs::{self, Belief, Branch};
 use crate::Matrix;
 use crate::checkpoint::{Layout, Parameters};
-use crate::engine::{Columns, CpuBackend, Head};
+use crate::engine::{AlignedRows, Columns, CpuBackend, Head};
 use crate::layers::{Linear, Weights, unit_rows};
 
 const PREFIX: &str = "blocks.corr_encoder.blocks.";
@@ -70,9 +70,9 @@ struct Layer {
 /// What a layer of attention leaves for the votes, a row for each correspondence.
 pub(super) struct Record {
     pub(super) queries: Matrix,
-    pub(super) keys: Matrix,
+    pub(super) keys: AlignedRows,
     /// The features after it, with unit length.
-    pub(super) features: Matrix,
+    pub(super) features: AlignedRows,
 }
 
 /// What the network says of correspondences.
@@ -122,17 +122,14 @@ impl Network {
         for (number, layer) in self.layers.iter().enumerate() {
             let noise = noise.map(|seed| Noise { seed, layer: number });
             let [queries, keys, values] = self.projected(layer, &features, &mut beliefs, noise)?;
-            let columns = |matrix| Columns { matrix, first: 0 };
-            let head = Head {
-                queries: columns(&queries),
-                keys: columns(&keys),
-                values: columns(&values),
-                channels: CHANNELS,
-            };
+            let keys = cpu.aligned(Columns::all(&keys), CHANNELS)?;
+            let values = &cpu.aligned(Columns::all(&values), CHANNELS)?;
+            let head = Head { queries: Columns::all(&queries), keys: &keys, values };
             layer.message.add(cpu, &head, compatibilities, &mut features)?;
             let mut unit = features.clone();
             unit_rows(&mut unit);
-            records.push(Record { queries, keys, features: unit });
+            let features = cpu.aligned(Columns::all(&unit), CHANNELS)?;
+            records.push(Record { queries, keys, features });
         }
         let confidences = self.classifier.confidences(cpu, &features)?;
         Ok(Encoded { features, confidences, records })

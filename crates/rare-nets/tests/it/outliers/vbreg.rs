@@ -95,12 +95,14 @@ fn nothing_depends_on_the_number_of_threads() {
     else {
         return;
     };
+    // More than one block of everything that is computed in blocks.
+    let pairs = &pairs[..600];
     for noise in [None, Some(3)] {
         let config = VbregConfig { noise, ..VbregConfig::three_d_match(Mode::Fixed) };
         let network = Vbreg::load(&parameters, config).unwrap();
         let run = || {
-            let encoding = network.encode(&pairs).unwrap();
-            (encoding, network.estimate(&no_cloud(), &no_cloud(), &pairs).unwrap())
+            let encoding = network.encode(pairs).unwrap();
+            (encoding, network.estimate(&no_cloud(), &no_cloud(), &pairs[..300]).ok())
         };
         assert_eq!(on_threads(1, run), on_threads(3, run));
     }
