@@ -18,6 +18,7 @@ pub mod geotransformer;
 mod hourglass;
 pub mod kpconv;
 pub mod predator;
+mod sampling;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};

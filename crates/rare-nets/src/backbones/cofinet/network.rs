@@ -82,6 +82,12 @@ impl CoFiNet {
         })
     }
 
+    /// Its settings.
+    #[must_use]
+    pub fn config(&self) -> &CoFiNetConfig {
+        &self.config
+    }
+
     /// Matches the two clouds of a pyramid, of which the first is the source.
     ///
     /// # Errors
@@ -100,7 +106,9 @@ impl CoFiNet {
         let fine_features = self.decoder.apply(cpu, pyramid, encoded.skipped.clone(), together)?;
         let coarse_confidences = self.coarse_confidences(&coarse_features)?;
         let kept = coarse_pairs(&coarse_confidences, &self.config);
-        let patches = patches(pyramid, self.config.patch);
+        let patches = [0, 1].map(|cloud| {
+            Patches::new(finest.clouds()[cloud], coarsest.clouds()[cloud], self.config.patch)
+        });
         let sides = halves(&fine_features, finest.lengths);
         let sides = Sides { features: sides.each_ref(), patches: patches.each_ref() };
         let matched = self.fine.apply(cpu, &sides, &kept.pairs)?;
@@ -136,18 +144,4 @@ impl CoFiNet {
         scores.values_mut().iter_mut().for_each(|score| *score *= factor);
         optimal_transport(&scores, self.bin, self.config.iterations)
     }
-}
-
-/// The patches of both clouds.
-fn patches(pyramid: &Pyramid, size: usize) -> [Patches; 2] {
-    let of = |cloud: usize| {
-        let points = |stage: &crate::backbones::kpconv::Stage| {
-            let first = if cloud == 0 { 0 } else { stage.lengths[0] };
-            stage.points.iter().skip(first).take(stage.lengths[cloud]).copied().collect::<Vec<_>>()
-        };
-        let fine = pyramid.stages.first().map(points).unwrap_or_default();
-        let coarse = pyramid.stages.last().map(points).unwrap_or_default();
-        Patches::new(&fine, &coarse, size)
-    };
-    [of(0), of(1)]
 }

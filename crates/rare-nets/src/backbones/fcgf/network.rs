@@ -93,6 +93,12 @@ impl Fcgf {
         })
     }
 
+    /// Its settings.
+    #[must_use]
+    pub fn config(&self) -> &FcgfConfig {
+        &self.config
+    }
+
     /// Features of the voxels of a cloud, metres.
     ///
     /// # Errors
