@@ -7,7 +7,7 @@
 //!
 //! | module | network | pose of its own |
 //! |---|---|---|
-//! | [`cofinet`] | CoFiNet (Yu et al.: NeurIPS 2021) | RANSAC |
+//! | [`cofinet`] | `CoFiNet` (Yu et al.: `NeurIPS` 2021) | RANSAC |
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
 //! | [`predator`] | Predator (Huang et al.: CVPR 2021) | RANSAC |
 

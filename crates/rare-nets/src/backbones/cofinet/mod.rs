@@ -1,5 +1,5 @@
 //! `CoFiNet` (Yu, Li, Saleh, Busam, Ilic: "CoFiNet: Reliable Coarse-to-fine Correspondences for Robust Point Cloud
-//! Registration", NeurIPS 2021): coarse points of two clouds are matched first, then the fine points around them.
+//! Registration", `NeurIPS` 2021): coarse points of two clouds are matched first, then the fine points around them.
 //!
 //! | step | file | takes and gives |
 //! |---|---|---|

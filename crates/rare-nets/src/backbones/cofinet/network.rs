@@ -15,7 +15,7 @@ use crate::checkpoint::Parameters;
 use crate::engine::{CpuBackend, Precision};
 use crate::layers::{Linear, Weights, products};
 
-/// The network with its weights (Yu et al.: `CoFiNet`, NeurIPS 2021).
+/// The network with its weights (Yu et al.: `CoFiNet`, `NeurIPS` 2021).
 pub struct CoFiNet {
     pub(super) config: CoFiNetConfig,
     cpu: CpuBackend,
