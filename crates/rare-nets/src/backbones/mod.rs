@@ -10,6 +10,7 @@
 
 pub mod geotransformer;
 pub mod kpconv;
+mod sampling;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
