@@ -9,6 +9,7 @@
 //! |---|---|---|
 //! | [`cofinet`] | `CoFiNet` (Yu et al.: `NeurIPS` 2021) | RANSAC |
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
+//! | [`geotransformer`] | `GeoTransformer` (Qin et al.: CVPR 2022) | local-to-global registration |
 //! | [`predator`] | Predator (Huang et al.: CVPR 2021) | RANSAC |
 
 pub mod cofinet;

@@ -73,8 +73,8 @@ impl CoFiNet {
     ) -> Result<u64> {
         let prepared = Prepared::new(source, target, &self.config.pyramid)?;
         let [source, target] = prepared.coarsest().map(|count| count as u64 + 1);
-        // The transport plan of coarse points in single and double precision; those of patches.
-        let plan = source.saturating_mul(target).saturating_mul(5);
+        // The transport plan of coarse points, its scores and confidences; those of patches.
+        let plan = source.saturating_mul(target).saturating_mul(4);
         let side = self.config.patch as u64 + 1;
         let patches = plan.min(self.config.most_pairs as u64) * side * side;
         Ok(prepared.bytes(&self.config.encoder(), limits) + (plan + patches) * WORD)

@@ -4,7 +4,7 @@
 //! | step | file | takes and gives |
 //! |---|---|---|
 //! | features | `network.rs` | clouds -> features of coarse and fine points |
-//! | coarse matches | `transport.rs`, `coarse.rs` | features of coarse points -> pairs of them |
+//! | coarse matches | `coarse.rs` | features of coarse points -> pairs of them |
 //! | patches | `patches.rs` | coarse and fine points -> the fine points around each coarse one |
 //! | fine matches | `sinkhorn.rs`, `fine.rs` | pairs of patches -> pairs of fine points |
 //! | description | `describe.rs` | two clouds -> correspondences and a pose |
@@ -17,7 +17,6 @@ mod layout;
 mod network;
 mod patches;
 mod sinkhorn;
-mod transport;
 
 pub use coarse::CoarsePair;
 pub use config::CoFiNetConfig;

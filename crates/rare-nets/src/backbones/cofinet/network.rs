@@ -7,12 +7,11 @@ use super::coarse::{CoarsePair, coarse_pairs};
 use super::fine::{FineMatching, FinePair, Sides};
 use super::layout::{COARSE, layout};
 use super::patches::Patches;
-use super::transport::optimal_transport;
 use crate::Matrix;
 use crate::backbones::hourglass::{Decoder, Encoder, MessagePassing, Turns, halves};
 use crate::backbones::kpconv::Pyramid;
 use crate::checkpoint::Parameters;
-use crate::engine::{CpuBackend, Precision};
+use crate::engine::{CpuBackend, Precision, log_transport};
 use crate::layers::{Linear, Weights, products};
 
 /// The network with its weights (Yu et al.: `CoFiNet`, `NeurIPS` 2021).
@@ -138,10 +137,15 @@ impl CoFiNet {
         Ok([step(first, Turns::Own)?, step(second, Turns::Other)?, step(third, Turns::Own)?])
     }
 
+    /// The plan of optimal transport between the coarse points, without what finds no partner.
     fn coarse_confidences(&self, [source, target]: &[Matrix; 2]) -> Result<Matrix> {
         let mut scores = products(&self.cpu, source, target)?;
         let factor = 1.0 / (source.columns() as f32).sqrt();
         scores.values_mut().iter_mut().for_each(|score| *score *= factor);
-        optimal_transport(&scores, self.bin, self.config.iterations)
+        let iterations = self.config.iterations;
+        let plan = log_transport(self.cpu.processor(), &scores, self.bin, iterations);
+        let rows = (0..source.rows()).map(|row| plan.row(row).iter().take(target.rows()));
+        let values = rows.flatten().map(|value| value.exp()).collect();
+        Matrix::new(source.rows(), target.rows(), values)
     }
 }
