@@ -7,8 +7,9 @@
 //!
 //! | module | network | pose of its own |
 //! |---|---|---|
-//! | [`cofinet`] | CoFiNet (Yu et al.: NeurIPS 2021) | RANSAC |
+//! | [`cofinet`] | `CoFiNet` (Yu et al.: `NeurIPS` 2021) | RANSAC |
 //! | [`fcgf`] | FCGF (Choy, Park, Koltun: ICCV 2019) | RANSAC |
+//! | [`geotransformer`] | `GeoTransformer` (Qin et al.: CVPR 2022) | local-to-global registration |
 //! | [`predator`] | Predator (Huang et al.: CVPR 2021) | RANSAC |
 
 mod backbone;
@@ -20,6 +21,7 @@ pub mod geotransformer;
 mod hourglass;
 pub mod kpconv;
 pub mod predator;
+mod sampling;
 
 pub use backbone::Backbone;
 

@@ -75,4 +75,27 @@ mod tests {
         assert_eq!(layer.apply(&cpu, &input.part(0, 0)).unwrap().rows(), 0);
         assert!(layer.apply(&cpu, &products).is_err());
     }
+
+    #[test]
+    fn products_of_any_size_are_those_of_the_definition() {
+        let cpu = CpuBackend::new(Precision::F32).unwrap();
+        let matrix = |rows: usize, columns: usize, step: usize| {
+            let values = (0..rows * columns).map(|at| ((at * step % 97) as f32 - 48.0) / 16.0);
+            Matrix::new(rows, columns, values.collect()).unwrap()
+        };
+        for (rows, columns, inner) in
+            [(31, 31, 8), (31, 8, 31), (30, 31, 8), (5, 70, 33), (1, 1, 1)]
+        {
+            let (left, right) = (matrix(rows, inner, 37), matrix(columns, inner, 41));
+            let found = products(&cpu, &left, &right).unwrap();
+            for (at, value) in found.values().iter().enumerate() {
+                let pairs = left.row(at / columns).iter().zip(right.row(at % columns));
+                let expected: f32 = pairs.map(|(a, b)| a * b).sum();
+                assert!(
+                    (value - expected).abs() < 1e-3,
+                    "{rows} {columns} {inner}: {value} {expected}"
+                );
+            }
+        }
+    }
 }

@@ -11,6 +11,9 @@ use crate::backbones::hourglass::Prepared;
 use crate::backbones::kpconv::NeighbourLimits;
 use crate::backbones::{Description, Keypoints, Selection};
 
+/// Bytes of a number.
+const WORD: u64 = 4;
+
 impl CoFiNet {
     /// Describes two clouds: `selection.count` of the pairs of points that the network finds, by its confidence, the
     /// points of these pairs with the decoder's features, and the pose that RANSAC finds in them. (The paper's tables
@@ -28,9 +31,9 @@ impl CoFiNet {
         limits: &NeighbourLimits,
         selection: &Selection,
     ) -> Result<Description> {
-        let network = format!("CoFiNet for {}", self.config.name);
-        let prepared = Prepared::new([source, target], &self.config.pyramid, limits, &network)?;
-        let output = self.run(&prepared.pyramid)?;
+        let sizes = &self.config.pyramid;
+        let prepared = Prepared::new(source, target, sizes)?;
+        let output = self.run(&prepared.pyramid(sizes, limits)?)?;
         let [of_source, of_target] = prepared.points();
         let second = of_source.len();
         let confidences: Vec<f32> = output.fine_pairs.iter().map(|pair| pair.confidence).collect();
@@ -44,7 +47,7 @@ impl CoFiNet {
         let correspondences: Vec<Correspondence> = chosen.iter().map(pair).collect();
         let target_from_source =
             pose(&self.config.ransac, [source, target], &correspondences, selection);
-        let mut warnings = prepared.warnings;
+        let mut warnings = prepared.warnings(sizes);
         warnings.extend(self.surplus(&output));
         let from = chosen.iter().map(|pair| (pair.source, pair.confidence));
         let to = chosen.iter().map(|pair| (pair.target, pair.confidence));
@@ -56,6 +59,26 @@ impl CoFiNet {
             neighbour_limits: Some(limits.0.clone()),
             warnings,
         })
+    }
+
+    /// An estimate of the bytes that [`CoFiNet::describe`] takes for these clouds. The clouds are thinned for it, which
+    /// takes less than they do.
+    ///
+    /// # Errors
+    /// Those of [`CoFiNet::describe`].
+    pub fn expected_bytes(
+        &self,
+        source: &[Point3<f64>],
+        target: &[Point3<f64>],
+        limits: &NeighbourLimits,
+    ) -> Result<u64> {
+        let prepared = Prepared::new(source, target, &self.config.pyramid)?;
+        let [source, target] = prepared.coarsest().map(|count| count as u64 + 1);
+        // The transport plan of coarse points, its scores and confidences; those of patches.
+        let plan = source.saturating_mul(target).saturating_mul(4);
+        let side = self.config.patch as u64 + 1;
+        let patches = plan.min(self.config.most_pairs as u64) * side * side;
+        Ok(prepared.bytes(&self.config.encoder(), limits) + (plan + patches) * WORD)
     }
 
     /// A remark if there were more coarse pairs than are looked at.

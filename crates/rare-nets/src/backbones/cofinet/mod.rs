@@ -1,10 +1,10 @@
 //! `CoFiNet` (Yu, Li, Saleh, Busam, Ilic: "CoFiNet: Reliable Coarse-to-fine Correspondences for Robust Point Cloud
-//! Registration", NeurIPS 2021): coarse points of two clouds are matched first, then the fine points around them.
+//! Registration", `NeurIPS` 2021): coarse points of two clouds are matched first, then the fine points around them.
 //!
 //! | step | file | takes and gives |
 //! |---|---|---|
 //! | features | `network.rs` | clouds -> features of coarse and fine points |
-//! | coarse matches | `transport.rs`, `coarse.rs` | features of coarse points -> pairs of them |
+//! | coarse matches | `coarse.rs` | features of coarse points -> pairs of them |
 //! | patches | `patches.rs` | coarse and fine points -> the fine points around each coarse one |
 //! | fine matches | `sinkhorn.rs`, `fine.rs` | pairs of patches -> pairs of fine points |
 //! | description | `describe.rs` | two clouds -> correspondences and a pose |
@@ -17,7 +17,6 @@ mod layout;
 mod network;
 mod patches;
 mod sinkhorn;
-mod transport;
 
 pub use coarse::CoarsePair;
 pub use config::CoFiNetConfig;

@@ -7,15 +7,14 @@ use super::coarse::{CoarsePair, coarse_pairs};
 use super::fine::{FineMatching, FinePair, Sides};
 use super::layout::{COARSE, layout};
 use super::patches::Patches;
-use super::transport::optimal_transport;
 use crate::Matrix;
 use crate::backbones::hourglass::{Decoder, Encoder, MessagePassing, Turns, halves};
 use crate::backbones::kpconv::Pyramid;
 use crate::checkpoint::Parameters;
-use crate::engine::{CpuBackend, Precision};
+use crate::engine::{CpuBackend, Precision, log_transport};
 use crate::layers::{Linear, Weights, products};
 
-/// The network with its weights (Yu et al.: `CoFiNet`, NeurIPS 2021).
+/// The network with its weights (Yu et al.: `CoFiNet`, `NeurIPS` 2021).
 pub struct CoFiNet {
     pub(super) config: CoFiNetConfig,
     cpu: CpuBackend,
@@ -82,6 +81,12 @@ impl CoFiNet {
         })
     }
 
+    /// Its settings.
+    #[must_use]
+    pub fn config(&self) -> &CoFiNetConfig {
+        &self.config
+    }
+
     /// Matches the two clouds of a pyramid, of which the first is the source.
     ///
     /// # Errors
@@ -100,7 +105,9 @@ impl CoFiNet {
         let fine_features = self.decoder.apply(cpu, pyramid, encoded.skipped.clone(), together)?;
         let coarse_confidences = self.coarse_confidences(&coarse_features)?;
         let kept = coarse_pairs(&coarse_confidences, &self.config);
-        let patches = patches(pyramid, self.config.patch);
+        let patches = [0, 1].map(|cloud| {
+            Patches::new(finest.clouds()[cloud], coarsest.clouds()[cloud], self.config.patch)
+        });
         let sides = halves(&fine_features, finest.lengths);
         let sides = Sides { features: sides.each_ref(), patches: patches.each_ref() };
         let matched = self.fine.apply(cpu, &sides, &kept.pairs)?;
@@ -130,24 +137,15 @@ impl CoFiNet {
         Ok([step(first, Turns::Own)?, step(second, Turns::Other)?, step(third, Turns::Own)?])
     }
 
+    /// The plan of optimal transport between the coarse points, without what finds no partner.
     fn coarse_confidences(&self, [source, target]: &[Matrix; 2]) -> Result<Matrix> {
         let mut scores = products(&self.cpu, source, target)?;
         let factor = 1.0 / (source.columns() as f32).sqrt();
         scores.values_mut().iter_mut().for_each(|score| *score *= factor);
-        optimal_transport(&scores, self.bin, self.config.iterations)
+        let iterations = self.config.iterations;
+        let plan = log_transport(self.cpu.processor(), &scores, self.bin, iterations);
+        let rows = (0..source.rows()).map(|row| plan.row(row).iter().take(target.rows()));
+        let values = rows.flatten().map(|value| value.exp()).collect();
+        Matrix::new(source.rows(), target.rows(), values)
     }
-}
-
-/// The patches of both clouds.
-fn patches(pyramid: &Pyramid, size: usize) -> [Patches; 2] {
-    let of = |cloud: usize| {
-        let points = |stage: &crate::backbones::kpconv::Stage| {
-            let first = if cloud == 0 { 0 } else { stage.lengths[0] };
-            stage.points.iter().skip(first).take(stage.lengths[cloud]).copied().collect::<Vec<_>>()
-        };
-        let fine = pyramid.stages.first().map(points).unwrap_or_default();
-        let coarse = pyramid.stages.last().map(points).unwrap_or_default();
-        Patches::new(&fine, &coarse, size)
-    };
-    [of(0), of(1)]
 }

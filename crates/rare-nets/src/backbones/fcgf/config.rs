@@ -91,8 +91,10 @@ impl FcgfConfig {
     #[must_use]
     pub fn fitted(mut self, parameters: &Parameters) -> FcgfConfig {
         if let Some([offsets, ..]) = parameters.shape("conv1.kernel") {
-            let side = (1..=*offsets).take_while(|side| side * side * side <= *offsets).last();
-            self.first_kernel = side.unwrap_or(self.first_kernel);
+            let fits = |side: &usize| side.checked_pow(3).is_some_and(|cube| cube <= *offsets);
+            let side = (1..=*offsets).take_while(fits).last();
+            // A kernel without a middle is none that the network knows: the layout will say so.
+            self.first_kernel = side.filter(|side| side % 2 == 1).unwrap_or(self.first_kernel);
         }
         if let Some([.., features]) = parameters.shape("final.kernel") {
             self.features = *features;

@@ -85,6 +85,12 @@ impl Fcgf {
         })
     }
 
+    /// Its settings.
+    #[must_use]
+    pub fn config(&self) -> &FcgfConfig {
+        &self.config
+    }
+
     /// Features of the voxels of a cloud, metres.
     ///
     /// # Errors
@@ -98,7 +104,7 @@ impl Fcgf {
         let maps = Maps::new(voxels.coordinates);
 
         let first = self.first.apply(&maps.voxels[0])?;
-        let down1 = self.first_block.apply(cpu, first, &maps.within[0])?;
+        let down1 = self.first_block.apply(cpu, &first, &maps.within[0])?;
         let down2 = self.down[0].apply(cpu, &down1, &maps.down[0], &maps.within[1])?;
         let down4 = self.down[1].apply(cpu, &down2, &maps.down[1], &maps.within[2])?;
         let down8 = self.down[2].apply(cpu, &down4, &maps.down[2], &maps.within[3])?;
@@ -157,11 +163,11 @@ impl Block {
         Ok(Block { first: part(1)?, second: part(2)? })
     }
 
-    fn apply(&self, cpu: &CpuBackend, input: Matrix, map: &KernelMap) -> Result<Matrix> {
-        let mut between = self.first.apply(cpu, &input, map)?;
+    fn apply(&self, cpu: &CpuBackend, input: &Matrix, map: &KernelMap) -> Result<Matrix> {
+        let mut between = self.first.apply(cpu, input, map)?;
         Activation::Relu.apply_to(between.values_mut());
         let mut output = self.second.apply(cpu, &between, map)?;
-        output.add(&input)?;
+        output.add(input)?;
         Activation::Relu.apply_to(output.values_mut());
         Ok(output)
     }
@@ -192,7 +198,7 @@ impl Stage {
         within: &KernelMap,
     ) -> Result<Matrix> {
         let moved = self.convolution.apply(cpu, input, between)?;
-        self.block.apply(cpu, moved, within)
+        self.block.apply(cpu, &moved, within)
     }
 }
 

@@ -181,3 +181,17 @@ fn softmax(scores: &mut Matrix, scale: f32) {
         row.iter_mut().for_each(|value| *value /= sum);
     });
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shares_of_a_row_add_up_to_one() {
+        let mut scores = Matrix::new(2, 3, vec![0.0, 2.0_f32.ln(), 0.0, 1e4, 0.0, -1e4]).unwrap();
+        softmax(&mut scores, 1.0);
+        for (found, expected) in scores.values().iter().zip([0.25, 0.5, 0.25, 1.0, 0.0, 0.0]) {
+            assert!((found - expected).abs() < 1e-6, "{found} {expected}");
+        }
+    }
+}

@@ -1,5 +1,7 @@
 //! The sizes of the network.
 
+use rare::pose::{LocalToGlobal, Mode};
+
 use crate::backbones::kpconv::PyramidConfig;
 
 /// The sizes and settings of a `GeoTransformer`; lengths in metres.
@@ -114,5 +116,19 @@ impl GeoTransformerConfig {
     /// Channels of a stage, the finest being 0.
     pub(super) fn channels(&self, stage: usize) -> usize {
         self.width << (stage + 1)
+    }
+}
+
+impl FineMatchingConfig {
+    /// How the pose is found from matches: each pair of patches proposes one, all matches vote (Qin et al., CVPR 2022,
+    /// section 3.4).
+    #[must_use]
+    pub fn local_to_global(&self) -> LocalToGlobal {
+        LocalToGlobal {
+            acceptance_radius: self.acceptance_radius,
+            refinement_steps: self.refinement_steps,
+            smallest_group: self.smallest_group,
+            mode: Mode::Faithful,
+        }
     }
 }

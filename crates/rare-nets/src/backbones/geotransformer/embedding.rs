@@ -123,6 +123,27 @@ impl GeometricEmbedding {
         tabulated(cpu, &self.distance, &self.wave_numbers, largest)
     }
 
+    /// The embedding of all pairs of a cloud, `count^2` rows.
+    pub(super) fn of_cloud(&self, cpu: &CpuBackend, points: &[Point]) -> Result<Matrix> {
+        let arrangement = self.arrangement(points)?;
+        let channels = 2 * self.wave_numbers.len();
+        let clouds = [arrangement, self.arrangement(points)?];
+        let curve = self.distances(cpu, &clouds)?;
+        let mut values = Vec::new();
+        for from in 0..points.len() {
+            let (distances, angles) = clouds[0].row(from);
+            for (&distance, angles) in distances.iter().zip(angles.chunks_exact(self.neighbours)) {
+                values.extend(self.of_pairs(&curve).of(
+                    cpu.processor(),
+                    distance,
+                    angles,
+                    channels,
+                ));
+            }
+        }
+        Ok(Matrix::from_rows(channels, values))
+    }
+
     /// The embedding as a function of distance and angles.
     pub(super) fn of_pairs<'a>(&'a self, distance: &'a Curve) -> PairEmbedding<'a> {
         PairEmbedding { distance, angle: &self.angle }
@@ -152,7 +173,8 @@ fn angle(a: &Point, b: &Point) -> f32 {
     let [bx, by, bz] = *b;
     let cross = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx];
     let sine = cross.iter().map(|value| value * value).sum::<f32>().sqrt();
-    sine.atan2(ax * bx + ay * by + az * bz)
+    // From zero, because the angle to a negative zero is not 0 but pi.
+    sine.atan2(0.0 + ax * bx + ay * by + az * bz)
 }
 
 /// A linear layer of sinusoids of a number from 0 to `largest`: sine and cosine alternate (Vaswani et al., 2017).
@@ -176,4 +198,68 @@ fn sinusoids(arguments: impl Iterator<Item = f64>, wave_numbers: &[f32]) -> Matr
         }
     }
     Matrix::from_rows(2 * wave_numbers.len(), values)
+}
+
+#[cfg(test)]
+mod tests {
+    use rare::random::Random;
+
+    use super::*;
+    use crate::engine::Precision;
+
+    #[test]
+    fn tables_give_what_the_layers_give() {
+        let cpu = CpuBackend::new(Precision::F32).unwrap();
+        let channels = 64;
+        let mut random = Random::new(7, 0);
+        let mut numbers = |count: usize, scale: f64| -> Vec<f32> {
+            (0..count).map(|_| (scale * (2.0 * random.uniform() - 1.0)) as f32).collect()
+        };
+        let wave_numbers: Vec<f32> = (0..channels / 2)
+            .map(|c| (-2.0 * c as f64 * 10_000_f64.ln() / channels as f64).exp() as f32)
+            .collect();
+        let mut layer = || {
+            let weight = numbers(channels * channels, (3.0 / channels as f64).sqrt());
+            let bias = numbers(channels, 0.1);
+            Linear::new(&cpu, Matrix::new(channels, channels, weight).unwrap(), Some(&bias))
+                .unwrap()
+        };
+        let (distance, angle) = (layer(), layer());
+        let curves = [(&distance, 30.0), (&angle, 12.0)]
+            .map(|(layer, largest)| tabulated(&cpu, layer, &wave_numbers, largest).unwrap());
+        let pairs = PairEmbedding { distance: &curves[0], angle: &curves[1] };
+        let (mut worst, mut largest) = (0.0_f32, 0.0_f32);
+        for _ in 0..200 {
+            let [x, a, b, c] =
+                [30.0, 12.0, 12.0, 12.0].map(|most| (most * random_unit(&mut numbers)) as f32);
+            let direct = |layer: &Linear, x: f32| {
+                layer.apply(&cpu, &sinusoids([f64::from(x)].into_iter(), &wave_numbers)).unwrap()
+            };
+            let [x_values, a_values, b_values, c_values] =
+                [(&distance, x), (&angle, a), (&angle, b), (&angle, c)]
+                    .map(|(layer, x)| direct(layer, x));
+            let found = pairs.of(cpu.processor(), x, &[a, b, c], channels);
+            for (channel, found) in found.iter().enumerate() {
+                let of = |values: &Matrix| values.values()[channel];
+                let expected = of(&x_values) + of(&a_values).max(of(&b_values)).max(of(&c_values));
+                worst = worst.max((found - expected).abs());
+                largest = largest.max(expected.abs());
+            }
+        }
+        assert!(worst / largest < 1e-6, "{worst} of {largest}");
+    }
+
+    fn random_unit(numbers: &mut impl FnMut(usize, f64) -> Vec<f32>) -> f64 {
+        f64::from(numbers(1, 1.0)[0].abs())
+    }
+
+    #[test]
+    fn angles_are_those_between_directions() {
+        assert!(
+            (angle(&[1.0, 0.0, 0.0], &[0.0, 3.0, 0.0]) - std::f32::consts::FRAC_PI_2).abs() < 1e-6
+        );
+        assert!((angle(&[1.0, 0.0, 0.0], &[-2.0, 0.0, 0.0]) - std::f32::consts::PI).abs() < 1e-6);
+        assert_eq!(angle(&[1.0, 0.0, 0.0], &[0.0; 3]), 0.0);
+        assert_eq!(angle(&[-1.0, -2.0, -3.0], &[0.0; 3]), 0.0);
+    }
 }

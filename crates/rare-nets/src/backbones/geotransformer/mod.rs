@@ -8,15 +8,18 @@
 //! | `embedding`, `attention`, `transformer` | 3.2 | superpoints that know of each other |
 //! | `superpoint_matching` | 3.2 | which superpoints belong together |
 //! | `point_matching` | 3.3 | which of their points |
-//! | `describe` | | from clouds to keypoints, correspondences and a pose |
+//! | `describe` | 3.4 | from clouds to keypoints, correspondences and a pose |
+//! | `memory` | | what a run will take |
 //!
 //! The paper's reference is our target, and comes first in all pairs.
 
 mod attention;
 mod backbone;
 mod config;
+mod describe;
 mod embedding;
 mod layout;
+mod memory;
 mod partition;
 mod point_matching;
 mod superpoint_matching;
@@ -26,15 +29,14 @@ pub use backbone::Watch;
 pub use config::{FineMatchingConfig, GeoTransformerConfig, TransformerConfig};
 pub use layout::layout;
 pub use partition::Partition;
-pub use point_matching::PointMatch;
+pub use point_matching::{PointMatch, match_points};
 pub use superpoint_matching::SuperpointMatch;
 
 use rare::nalgebra::Point3;
-use rare::pose::{LocalToGlobal, Mode, PoseEstimate};
 use rare::{Correspondence, Error, Result};
 
 use self::backbone::Backbone;
-use self::point_matching::{match_points, transport};
+use self::point_matching::transport;
 use self::superpoint_matching::match_superpoints;
 use self::transformer::Transformer;
 use super::kpconv::{Point, Pyramid, Stage};
@@ -140,22 +142,13 @@ impl GeoTransformer {
         })
     }
 
-    /// Local-to-global registration (section 3.4): each pair of patches proposes a pose, all matches vote.
+    /// The embedding of all pairs of superpoints (metres), row by row: what the network sees of their arrangement. The
+    /// network itself never forms it.
     ///
     /// # Errors
-    /// `NoPose` if the correspondences determine none.
-    pub fn pose(&self, pairs: &[Correspondence], groups: &[Vec<usize>]) -> Result<PoseEstimate> {
-        self.local_to_global().most_agreed(pairs, groups)
-    }
-
-    fn local_to_global(&self) -> LocalToGlobal {
-        let fine = &self.config.fine;
-        LocalToGlobal {
-            acceptance_radius: fine.acceptance_radius,
-            refinement_steps: fine.refinement_steps,
-            smallest_group: fine.smallest_group,
-            mode: Mode::Faithful,
-        }
+    /// `InvalidInput` if there are too few superpoints or they span too much.
+    pub fn geometric_structure(&self, superpoints: &[Point]) -> Result<Matrix> {
+        self.transformer.embedding.of_cloud(&self.cpu, superpoints)
     }
 }
 

@@ -55,7 +55,8 @@ fn patches<'a>(partitions: &'a [Partition; 2], pair: &SuperpointMatch) -> [&'a [
 
 /// The matches in all plans, patch by patch, row by row: what is among the best of its row and of its column and sure
 /// enough.
-pub(super) fn match_points(
+#[must_use]
+pub fn match_points(
     plans: &[Matrix],
     partitions: &[Partition; 2],
     matches: &[SuperpointMatch],

@@ -16,7 +16,7 @@ mod preparation;
 use crate::Matrix;
 
 pub(super) use decoder::{Decoder, DecoderSizes};
-pub(super) use encoder::{Encoded, Encoder, EncoderSizes};
+pub(super) use encoder::{Encoder, EncoderSizes};
 pub(super) use message_passing::{MessagePassing, Turns, pointwise};
 pub(super) use preparation::Prepared;
 

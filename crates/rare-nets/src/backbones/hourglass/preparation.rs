@@ -1,75 +1,84 @@
-//! Clouds made ready for a network that was trained on points of one density.
+//! Clouds made ready for a network.
 
-use rare::data::{resolution, voxel_downsample};
 use rare::nalgebra::Point3;
 use rare::{Error, Result};
 
-use crate::backbones::kpconv::{NeighbourLimits, Point, Pyramid, PyramidConfig};
+use super::EncoderSizes;
+use crate::backbones::kpconv::{
+    NeighbourLimits, Point, Pyramid, PyramidConfig, StagePoints, pyramid_bytes,
+};
+use crate::backbones::sampling::{Sampled, sampled};
 
-/// Points that are closer to each other than this share of a voxel are thinned. In clouds with a point in each voxel the
-/// median distance to the nearest other point is 0.6 to 0.9 voxels.
-const DENSE: f64 = 0.5;
-/// Points that are further apart than so many voxels are not what a network knows.
-const SPARSE: f64 = 2.0;
-
-/// Two clouds at the density of a network.
+/// Two clouds at the density of a network, the source first.
 pub(in crate::backbones) struct Prepared {
-    /// The stages of both clouds, the source first.
-    pub(in crate::backbones) pyramid: Pyramid,
-    /// What the caller should know.
-    pub(in crate::backbones) warnings: Vec<String>,
+    clouds: [Sampled; 2],
+    stages: Vec<StagePoints>,
 }
 
 impl Prepared {
-    /// Thins clouds (metres, local frames) that are denser than the voxels of the first stage, and finds all neighbours.
+    /// Thins clouds (metres, local frames) that are denser than the voxels of the first stage, and finds the points of all
+    /// stages.
     ///
     /// # Errors
-    /// `InvalidInput` if a cloud is empty or too large for the voxels, or the limits do not fit.
+    /// `InvalidInput` if a cloud is empty, not finite or too large for the voxels.
     pub(in crate::backbones) fn new(
-        clouds: [&[Point3<f64>]; 2],
+        source: &[Point3<f64>],
+        target: &[Point3<f64>],
+        config: &PyramidConfig,
+    ) -> Result<Prepared> {
+        let of = |points: &[Point3<f64>], name: &str| {
+            sampled(points, config.voxel, config.voxel(config.stages)).map_err(
+                |error| match error {
+                    Error::InvalidInput(what) => Error::invalid(format!("the {name}: {what}")),
+                    other => other,
+                },
+            )
+        };
+        let clouds = [of(source, "source")?, of(target, "target")?];
+        let stages =
+            StagePoints::new(clouds.each_ref().map(|cloud| cloud.points.as_slice()), config)?;
+        Ok(Prepared { clouds, stages })
+    }
+
+    /// The stages with all neighbours, no more than `limits` of each point.
+    ///
+    /// # Errors
+    /// `InvalidInput` if the limits are not one for each stage.
+    pub(in crate::backbones) fn pyramid(
+        &self,
         config: &PyramidConfig,
         limits: &NeighbourLimits,
-        network: &str,
-    ) -> Result<Prepared> {
-        let [source, target] = clouds;
-        let (source, of_source) = thinned(source, "source", config.voxel, network)?;
-        let (target, of_target) = thinned(target, "target", config.voxel, network)?;
-        let pyramid = Pyramid::new([&source, &target], config, limits)?;
-        Ok(Prepared { pyramid, warnings: of_source.into_iter().chain(of_target).collect() })
+    ) -> Result<Pyramid> {
+        Pyramid::over(self.stages.clone(), config, limits)
     }
 
     /// The points of the first stage of either cloud, metres, local frames.
     pub(in crate::backbones) fn points(&self) -> [Vec<Point3<f64>>; 2] {
-        let Some(finest) = self.pyramid.stages.first() else { return [Vec::new(), Vec::new()] };
-        let wide = |point: &Point| Point3::from(point.map(f64::from));
-        let (source, target) = finest.points.split_at(finest.lengths[0].min(finest.points.len()));
-        [source, target].map(|points| points.iter().map(wide).collect())
+        self.clouds.each_ref().map(|cloud| {
+            let place = |point: &Point| Point3::from(point.map(f64::from)) + cloud.shift;
+            cloud.points.iter().map(place).collect()
+        })
     }
-}
 
-/// A cloud with no more points than the network knows, and a remark if it has far fewer.
-fn thinned(
-    cloud: &[Point3<f64>],
-    name: &str,
-    voxel: f64,
-    network: &str,
-) -> Result<(Vec<Point>, Option<String>)> {
-    if let Some(bad) = cloud.iter().find(|point| !point.iter().all(|value| value.is_finite())) {
-        return Err(Error::invalid(format!(
-            "the {name} has the point ({}, {}, {}), and no network takes what is not finite: leave such points out",
-            bad.x, bad.y, bad.z
-        )));
+    /// What to say if the clouds are unlike those of the training.
+    pub(in crate::backbones) fn warnings(&self, config: &PyramidConfig) -> Vec<String> {
+        let named = self.clouds.iter().zip(["source", "target"]);
+        named.filter_map(|(cloud, name)| cloud.warning(name, config.voxel)).collect()
     }
-    let distance = resolution(cloud);
-    let warning = (distance > SPARSE * voxel).then(|| {
-        format!(
-            "{network} was trained on points about {voxel} m apart, those of the {name} are {distance:.3} m apart: \
-             check the unit of the cloud (metres), or take a network for such clouds"
-        )
-    });
-    let narrow = |points: &[Point3<f64>]| -> Vec<Point> {
-        points.iter().map(|point| [point.x as f32, point.y as f32, point.z as f32]).collect()
-    };
-    let dense = distance < DENSE * voxel;
-    Ok((if dense { narrow(&voxel_downsample(cloud, voxel)?) } else { narrow(cloud) }, warning))
+
+    /// An estimate of the bytes that the pyramid takes with the features of the encoder and the decoder.
+    pub(in crate::backbones) fn bytes(
+        &self,
+        sizes: &EncoderSizes,
+        limits: &NeighbourLimits,
+    ) -> u64 {
+        let counts: Vec<usize> = self.stages.iter().map(|stage| stage.points.len()).collect();
+        let channels: Vec<usize> = (0..counts.len()).map(|stage| sizes.width << stage).collect();
+        pyramid_bytes(&counts, limits, &channels)
+    }
+
+    /// Coarse points of each cloud.
+    pub(in crate::backbones) fn coarsest(&self) -> [usize; 2] {
+        self.stages.last().map(|stage| stage.lengths).unwrap_or_default()
+    }
 }

@@ -88,9 +88,9 @@ mod tests {
 
     #[test]
     fn voxels_give_their_barycentre_in_order_of_appearance() {
-        let points = [[0.9, 0.1, 0.1], [-0.2, 0.0, 0.0], [0.7, 0.3, 0.5], [-0.4, 0.2, 0.4]];
+        let points = [[0.5, 0.25, 0.0], [-0.25, 0.0, 0.0], [0.75, 0.5, 0.5], [-0.5, 0.25, 0.5]];
         let thinned = subsample(&points, 1.0).unwrap();
-        assert_eq!(thinned, [[0.8, 0.2, 0.3], [-0.3, 0.1, 0.2]].map(|p: [f32; 3]| p));
+        assert_eq!(thinned, [[0.625, 0.375, 0.25], [-0.375, 0.125, 0.25]]);
         assert!(subsample(&[], 1.0).unwrap().is_empty());
     }
 

@@ -9,6 +9,9 @@ use crate::backbones::hourglass::Prepared;
 use crate::backbones::kpconv::NeighbourLimits;
 use crate::backbones::{Description, Keypoints, Selection};
 
+/// Bytes of a number.
+const WORD: u64 = 4;
+
 impl Predator {
     /// Describes two clouds: `selection.count` keypoints of each by the product of overlap and saliency, for each source
     /// keypoint the target keypoint with the nearest feature, and the pose that RANSAC finds in these pairs, whose scores
@@ -27,9 +30,9 @@ impl Predator {
         limits: &NeighbourLimits,
         selection: &Selection,
     ) -> Result<Description> {
-        let network = format!("Predator for {}", self.config.name);
-        let prepared = Prepared::new([source, target], &self.config.pyramid, limits, &network)?;
-        let output = self.run(&prepared.pyramid)?;
+        let sizes = &self.config.pyramid;
+        let prepared = Prepared::new(source, target, sizes)?;
+        let output = self.run(&prepared.pyramid(sizes, limits)?)?;
         let [of_source, of_target] = prepared.points();
         let second = of_source.len();
         let from = keypoints(&output, of_source, 0, selection)?;
@@ -38,7 +41,7 @@ impl Predator {
         let pairs =
             correspondences(&from.features, &to.features, &matches, |pair| pair.similarity(1));
         let target_from_source = pose(&self.config.ransac, [source, target], &pairs, selection);
-        let mut warnings = prepared.warnings;
+        let mut warnings = prepared.warnings(sizes);
         warnings.extend(self.small_graphs(output.degrees));
         Ok(Description {
             source: from,
@@ -48,6 +51,25 @@ impl Predator {
             neighbour_limits: Some(limits.0.clone()),
             warnings,
         })
+    }
+
+    /// An estimate of the bytes that [`Predator::describe`] takes for these clouds. The clouds are thinned for it, which
+    /// takes less than they do.
+    ///
+    /// # Errors
+    /// Those of [`Predator::describe`].
+    pub fn expected_bytes(
+        &self,
+        source: &[Point3<f64>],
+        target: &[Point3<f64>],
+        limits: &NeighbourLimits,
+    ) -> Result<u64> {
+        let prepared = Prepared::new(source, target, &self.config.pyramid)?;
+        // Edges of a graph, and their products before and after they are normalised.
+        let edges =
+            prepared.coarsest().iter().sum::<usize>() as u64 * self.config.neighbours as u64;
+        Ok(prepared.bytes(&self.config.encoder(), limits)
+            + edges * 4 * self.config.coarse_channels as u64 * WORD)
     }
 
     /// A remark if a cloud has fewer coarse points than the graph wants.

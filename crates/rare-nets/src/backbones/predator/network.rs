@@ -88,6 +88,12 @@ impl Predator {
         })
     }
 
+    /// Its settings.
+    #[must_use]
+    pub fn config(&self) -> &PredatorConfig {
+        &self.config
+    }
+
     /// Features and scores of the points of a pyramid, whose first cloud is the source.
     ///
     /// # Errors
@@ -127,7 +133,7 @@ impl Predator {
         let Some(coarsest) = pyramid.stages.last() else {
             return Err(Error::Internal("a pyramid without stages".to_owned()));
         };
-        let (source, target) = coarsest.points.split_at(coarsest.lengths[0]);
+        let [source, target] = coarsest.clouds();
         let graphs = [source, target].map(|points| Graph::new(points, self.config.neighbours));
         if graphs.iter().any(|graph| graph.degree() == 0) {
             return Err(Error::invalid(format!(

@@ -5,7 +5,7 @@ use std::fs;
 use rare::nalgebra::Point3;
 use rare_nets::backbones::cofinet::{self, CoFiNet, CoFiNetConfig};
 use rare_nets::backbones::fcgf::{Fcgf, FcgfConfig};
-use rare_nets::backbones::kpconv::NeighbourLimits;
+use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid};
 use rare_nets::backbones::predator::{self, Predator, PredatorConfig};
 use rare_nets::backbones::{Description, Selection};
 use rare_nets::checkpoint::{Layout, Parameters};
@@ -100,10 +100,33 @@ fn cofinet_on_rooms() {
     let network = CoFiNet::load(&weights(&cofinet::layout(&config), 0.0625), config).unwrap();
     let (limits, selection) =
         (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
+    let expected = network.expected_bytes(&source, &target, &limits).unwrap() >> 20;
+    println!("expected: {expected} MB");
     let description = measured("cofinet: pair", || {
         network.describe(&source, &target, &limits, &selection).unwrap()
     });
     say(&description);
+    let narrow = |cloud: &[Point3<f64>]| -> Vec<[f32; 3]> {
+        cloud.iter().map(|point| [point.x as f32, point.y as f32, point.z as f32]).collect()
+    };
+    let clouds = [narrow(&source), narrow(&target)];
+    let sizes = network.config().pyramid;
+    let pyramid = measured("pyramid alone", || {
+        Pyramid::new([&clouds[0], &clouds[1]], &sizes, &limits).unwrap()
+    });
+    let output = measured("cofinet: network alone", || network.run(&pyramid).unwrap());
+    let lengths: Vec<_> = pyramid.stages.iter().map(|stage| stage.lengths).collect();
+    let sources: std::collections::BTreeSet<_> =
+        output.fine_pairs.iter().map(|p| p.source).collect();
+    let targets: std::collections::BTreeSet<_> =
+        output.fine_pairs.iter().map(|p| p.target).collect();
+    println!(
+        "{lengths:?}, {} coarse pairs, {} fine: {} {}",
+        output.coarse_pairs.len(),
+        output.fine_pairs.len(),
+        sources.len(),
+        targets.len()
+    );
 }
 
 #[test]
@@ -114,6 +137,8 @@ fn predator_on_rooms() {
     let network = Predator::load(&weights(&predator::layout(&config), 0.0625), config).unwrap();
     let (limits, selection) =
         (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
+    let expected = network.expected_bytes(&source, &target, &limits).unwrap() >> 20;
+    println!("expected: {expected} MB");
     let description = measured("predator: pair", || {
         network.describe(&source, &target, &limits, &selection).unwrap()
     });

@@ -1,6 +1,7 @@
 //! Recorded pairs of clouds and stages of networks on them.
 
-use rare::nalgebra::Point3;
+use rare::nalgebra::{Point3, Vector3};
+use rare::{Correspondence, RigidTransform};
 use rare_nets::Matrix;
 use rare_nets::backbones::Description;
 use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid, PyramidConfig};
@@ -45,6 +46,28 @@ pub(crate) fn described(describe: impl Fn() -> Description + Sync) -> Descriptio
     assert!(one.target_from_source.as_ref().ok() == three.target_from_source.as_ref().ok());
     assert!(one.correspondences.is_sorted_by(|a, b| a.score >= b.score));
     one
+}
+
+/// Between the recorded source and where `moved` puts it. Whole voxels of all stages, so that the grids are the same.
+const STEP: [f64; 3] = [1.6, -0.8, 2.4];
+
+/// A cloud somewhere else.
+pub(crate) fn moved(cloud: &[Point3<f64>]) -> Vec<Point3<f64>> {
+    cloud.iter().map(|point| point + Vector3::from(STEP)).collect()
+}
+
+/// Makes sure that a description of a cloud and the moved one finds where it went, within so many metres.
+pub(crate) fn finds_the_step(description: &Description, tolerance: f64) {
+    let pose = description.target_from_source.as_ref().unwrap();
+    let truth = RigidTransform::from_translation(Vector3::from(STEP));
+    let error = pose.error_to(&truth);
+    println!("pose: {:.1e} degrees, {:.1e} m", error.rotation_degrees, error.translation);
+    assert!(error.rotation_degrees < 0.5 && error.translation < tolerance, "{error:?}");
+    let exact = |pair: &&Correspondence| {
+        (pair.target - pair.source - truth.translation()).norm() < tolerance
+    };
+    let exact = description.correspondences.iter().filter(exact).count();
+    assert!(2 * exact > description.correspondences.len(), "{exact}");
 }
 
 /// Compares features with a recorded array, whose rows may be the channels of sequences.
