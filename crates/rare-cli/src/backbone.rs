@@ -7,6 +7,7 @@ use std::time::Instant;
 use anyhow::{Context, Result};
 use rare::pose::PoseEstimator;
 use rare::{PointCloud, Scan};
+use rare_nets::backbones::kpconv::NeighbourLimits;
 use rare_nets::backbones::{Backbone, Description, Request, Selection};
 use rare_nets::cache::WeightsIdentity;
 use rare_nets::networks::{self, Network, TrainedOn};
@@ -160,13 +161,13 @@ impl OpenBackbone {
         let clock = Instant::now();
         let request = Request {
             selection: self.selection,
-            neighbour_limits: self.neighbour_limits.clone(),
+            neighbour_limits: self.neighbour_limits.clone().map(NeighbourLimits),
             memory: memory::available(),
         };
         let description = self.backbone.describe(&source.cloud, &reference.cloud, &request)?;
         source.features = Some(description.source.features.clone());
         reference.features = Some(description.target.features.clone());
-        let neighbor_limits = description.neighbour_limits.clone();
+        let neighbor_limits = description.neighbour_limits.as_ref().map(|limits| limits.0.clone());
         let record = BackboneRecord { neighbor_limits, ..self.record.clone() };
         Ok(Described { description, seconds: clock.elapsed().as_secs_f64(), record })
     }

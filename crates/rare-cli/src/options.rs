@@ -14,7 +14,7 @@ use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 pub(crate) use diffusion::Diffusion;
 use diffusion::DiffusionOptions;
-pub(crate) use networks::{Backbone, BackboneChoice, Filter, InitMethod};
+pub(crate) use networks::{Backbone, BackboneChoice, InitMethod};
 use rare::scale::Profile;
 use rare::viewpoints::CameraChoice;
 use rare::{Recipe, RefinerConfig};

@@ -12,9 +12,9 @@ use crate::backbones::fcgf::{self, FcgfConfig};
 use crate::backbones::geotransformer::{self, GeoTransformerConfig};
 use crate::backbones::predator::{self, PredatorConfig};
 use crate::backbones::{Backbone, fitted};
+use crate::checkpoint::{Differences, Layout, Parameters, compare};
 use crate::outliers::pointdsc::{self, PointDsc, PointDscConfig};
 use crate::outliers::vbreg::{self, Vbreg, VbregConfig};
-use crate::checkpoint::{Differences, Layout, Parameters, compare};
 
 /// A network on points.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]

@@ -24,6 +24,7 @@ pub mod predator;
 mod sampling;
 
 pub use backbone::Backbone;
+use kpconv::NeighbourLimits;
 
 use rare::nalgebra::Vector3;
 use rare::{Correspondence, PointCloud, PointFeatures, Result, RigidTransform};
@@ -41,7 +42,7 @@ pub struct Description {
     /// What the method itself makes of the correspondences: moves points of the source into the target's frame.
     pub target_from_source: Result<RigidTransform>,
     /// Most neighbours that each stage looked at, for networks of kernel point convolutions.
-    pub neighbour_limits: Option<Vec<usize>>,
+    pub neighbour_limits: Option<NeighbourLimits>,
     /// What the caller should know, in words.
     pub warnings: Vec<String>,
 }
@@ -53,7 +54,7 @@ pub struct Request {
     pub selection: Selection,
     /// Most neighbours of a point, stage by stage, for networks of kernel point convolutions; those of the authors, or
     /// by their rule from the clouds, if `None`.
-    pub neighbour_limits: Option<Vec<usize>>,
+    pub neighbour_limits: Option<NeighbourLimits>,
     /// Bytes that may be taken; clouds that need more are refused beforehand.
     pub memory: Option<u64>,
 }

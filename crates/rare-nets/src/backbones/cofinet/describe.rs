@@ -56,7 +56,7 @@ impl CoFiNet {
             target: keypoints(&output, of_target, second, to)?,
             correspondences,
             target_from_source,
-            neighbour_limits: Some(limits.0.clone()),
+            neighbour_limits: Some(limits.clone()),
             warnings,
         })
     }

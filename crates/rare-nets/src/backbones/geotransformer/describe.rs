@@ -44,6 +44,7 @@ impl GeoTransformer {
             target: keypoints(&registration, &chosen, &kept, Side::Target)?.moved(&shifts[0]),
             correspondences: chosen.iter().map(|pair| moved(pair, &shifts)).collect(),
             target_from_source: pose.map(|found| unshifted(&found.target_from_source, &shifts)),
+            neighbour_limits: Some(limits.clone()),
             warnings: self.warnings(&sampled),
         })
     }

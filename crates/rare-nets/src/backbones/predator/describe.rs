@@ -48,7 +48,7 @@ impl Predator {
             target: to,
             correspondences: pairs,
             target_from_source,
-            neighbour_limits: Some(limits.0.clone()),
+            neighbour_limits: Some(limits.clone()),
             warnings,
         })
     }
