@@ -68,7 +68,7 @@ mod tests {
         assert_eq!((result.rows(), result.columns()), (10, 11));
         for row in 0..9 {
             let sum: f32 = result.row(row).iter().map(|value| value.exp()).sum();
-            assert!((sum - 1.0).abs() < 1e-3, "{sum}");
+            assert!((sum - 1.0).abs() < 1e-2, "{sum}");
         }
         for column in 0..10 {
             let sum: f32 = (0..10).map(|row| result.row(row)[column].exp()).sum();

@@ -162,3 +162,75 @@ fn positive(features: &Matrix) -> Vec<bool> {
     let columns = features.columns().max(1);
     features.values().par_chunks(columns).map(|row| row.iter().sum::<f32>() > 0.0).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use rare::random::Random;
+
+    use super::super::neighbours;
+    use super::*;
+    use crate::engine::Precision;
+
+    #[test]
+    fn convolutions_are_those_of_the_definition() {
+        let mut random = Random::new(3, 0);
+        let mut number = || (2.0 * random.uniform() - 1.0) as f32;
+        let (points, inputs, outputs, sigma) = (15, 5, 7, 0.5);
+        let kernel: Vec<Point> = (0..points).map(|_| [number(), number(), number()]).collect();
+        let weights: Vec<f32> = (0..points * inputs * outputs).map(|_| number()).collect();
+        let support: Vec<Point> = (0..200).map(|_| [number(), number(), number()]).collect();
+        let bias: Vec<f32> = (0..outputs).map(|_| number()).collect();
+        let features =
+            Matrix::new(200, inputs, (0..200 * inputs).map(|_| number()).collect()).unwrap();
+        let cpu = CpuBackend::new(Precision::F32).unwrap();
+        let mut positions = [[FAR; LANES]; 3];
+        for (index, point) in kernel.iter().enumerate() {
+            (0..3).for_each(|axis| positions[axis][index] = point[axis]);
+        }
+        let matrix = Matrix::new(points * inputs, outputs, weights.clone()).unwrap().transposed();
+        let layer = KernelPointConvolution {
+            kernel: positions,
+            points,
+            reciprocal_sigma: (1.0 / sigma) as f32,
+            inputs,
+            linear: Linear::new(&cpu, matrix, None).unwrap(),
+            bias: Some(bias.clone()),
+        };
+        let queries = &support[..50];
+        let lengths = [[50, 0], [200, 0]];
+        // Most rows are filled up.
+        let found = neighbours([queries, &support], lengths, 0.6, 60).unwrap();
+        let around = Neighbourhood { queries, support: &support, neighbours: &found };
+        let result = layer.apply(&cpu, around, &features).unwrap();
+        for (query, center) in queries.iter().enumerate() {
+            let near: Vec<usize> = found
+                .row(query)
+                .iter()
+                .map(|&index| index as usize)
+                .filter(|&index| index < 200)
+                .collect();
+            let positive =
+                near.iter().filter(|&&index| features.row(index).iter().sum::<f32>() > 0.0);
+            let share = 1.0 / positive.count().max(1) as f64;
+            for output in 0..outputs {
+                let mut sum = 0.0;
+                for &index in &near {
+                    for (k, kernel) in kernel.iter().enumerate() {
+                        let offset = (0..3).map(|axis| {
+                            f64::from(support[index][axis] - center[axis] - kernel[axis]).powi(2)
+                        });
+                        let influence = (1.0 - offset.sum::<f64>().sqrt() / sigma).max(0.0);
+                        for (input, value) in features.row(index).iter().enumerate() {
+                            let weight = weights[(k * inputs + input) * outputs + output];
+                            sum += influence * f64::from(*value) * f64::from(weight);
+                        }
+                    }
+                }
+                let expected = sum * share + f64::from(bias[output]);
+                let difference = (f64::from(result.row(query)[output]) - expected).abs();
+                assert!(difference < 1e-5, "{query} {output}: {difference}");
+            }
+        }
+        assert!(layer.apply(&cpu, around, &result).is_err());
+    }
+}

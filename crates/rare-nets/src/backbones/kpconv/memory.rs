@@ -40,3 +40,19 @@ pub fn pyramid_bytes(counts: &[usize], limits: &NeighbourLimits, channels: &[usi
     // Not finer than a stage: what blocks of rows take while they are aggregated.
     stages.saturating_add(super::convolution::BLOCK_BYTES as u64 * 3)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn estimates_grow_with_points_and_never_wrap() {
+        let limits = NeighbourLimits::three_d_match();
+        let bytes =
+            |points| pyramid_bytes(&expected_counts(points, 4), &limits, &[128, 256, 512, 1024]);
+        assert_eq!(expected_counts(27, 4), [27, 9, 3, 1]);
+        assert!(bytes(30_000) < bytes(60_000) && bytes(30_000) < 1 << 30);
+        assert!(bytes(10_000_000) > 20 << 30);
+        assert_eq!(bytes(usize::MAX), u64::MAX);
+    }
+}

@@ -6,9 +6,9 @@ use rare_nets::backbones::Selection;
 use rare_nets::backbones::cofinet::{CoFiNet, CoFiNetConfig, Output, layout};
 use rare_nets::backbones::kpconv::{NeighbourLimits, PyramidConfig};
 
-use super::formula::official_layout;
 use super::recorded::{
-    TOLERANCE, clouds, compare, compare_change, described, finds_the_step, moved, pyramid, weights,
+    TOLERANCE, clouds, compare, compare_change, described, finds_the_step, moved, official_layout,
+    pyramid, weights,
 };
 use crate::shared::{GoldenTensors, relative_difference};
 

@@ -1,13 +1,13 @@
 //! FCGF against two references of its semantics that agree with each other: the arrays are theirs.
 
+use rare::Result;
 use rare::nalgebra::Point3;
 use rare_nets::Matrix;
 use rare_nets::backbones::Selection;
 use rare_nets::backbones::fcgf::{Fcgf, FcgfConfig, layout};
-use rare_nets::checkpoint::Parameters;
 
-use super::formula::{official_layout, open_tensors, uniform};
-use super::recorded::{described, finds_the_step, moved};
+use super::formula::{open_tensors, uniform};
+use super::recorded::{described, finds_the_step, moved, official_layout};
 use crate::shared::{GoldenTensors, relative_difference};
 
 /// The largest relative difference of features.
@@ -17,10 +17,11 @@ fn tiny() -> FcgfConfig {
     FcgfConfig { voxel: 0.1, first_kernel: 5, ..FcgfConfig::three_d_match() }
 }
 
-/// Weights by the formula of the recorded arrays; kernels with one offset have `leading` sizes before the others.
-pub(crate) fn weights(config: &FcgfConfig, leading: &[usize]) -> Parameters {
+/// The network with weights by the formula of the recorded arrays, of the sizes in `weights`; kernels with one offset have
+/// `leading` sizes before the others.
+pub(crate) fn load(weights: &FcgfConfig, leading: &[usize], config: FcgfConfig) -> Result<Fcgf> {
     let tensor = |(name, shape): (&String, &Vec<usize>)| {
-        let mut values = uniform(name, shape.iter().product());
+        let values = uniform(name, shape.iter().product());
         let fan_in = match shape.as_slice() {
             [offsets, inputs, _] => offsets * inputs,
             [inputs, _] => *inputs,
@@ -34,13 +35,14 @@ pub(crate) fn weights(config: &FcgfConfig, leading: &[usize]) -> Parameters {
             "num_batches_tracked" => (0.0, 1.0),
             _ => (0.1, 0.0),
         };
-        values.iter_mut().for_each(|value| *value = factor * *value + summand);
+        let values = values.map(|value| factor * value as f32 + summand).collect();
         let leads = name.ends_with("kernel") && shape.len() == 2;
         let leading = if leads { leading } else { &[] };
         (name.clone(), [leading, shape].concat(), values)
     };
-    let tensors: Vec<_> = layout(config).iter().map(tensor).collect();
-    open_tensors(&tensors)
+    let tensors: Vec<_> = layout(weights).iter().map(tensor).collect();
+    let folder = tempfile::tempdir().unwrap();
+    Fcgf::load(&open_tensors(folder.path(), &tensors), config)
 }
 
 fn points(values: &[f64]) -> Vec<Point3<f64>> {
@@ -65,7 +67,7 @@ fn compare(golden: &GoldenTensors, name: &str, features: &Matrix, tolerance: f64
 #[test]
 fn every_stage_is_that_of_the_references() {
     let Some(golden) = GoldenTensors::open("backbones/fcgf_tiny.safetensors") else { return };
-    let network = Fcgf::load(&weights(&tiny(), &[]), tiny()).unwrap();
+    let network = load(&tiny(), &[], tiny()).unwrap();
     let output = network.run(&centres(&golden)).unwrap();
     for (coordinates, stride) in output.coordinates.iter().zip([1, 2, 4, 8]) {
         let flat: Vec<f64> = coordinates.iter().flatten().map(|&value| value.into()).collect();
@@ -97,7 +99,7 @@ fn the_first_point_of_every_voxel_is_kept() {
     // The references divide in single precision: done here, for voxels of 1 m.
     let scaled = pair.array("in.points.0").f32();
     let scaled: Vec<f64> = scaled[..3 * count].iter().map(|x| f64::from(x / 0.1)).collect();
-    let network = Fcgf::load(&weights(&tiny(), &[]), FcgfConfig { voxel: 1.0, ..tiny() }).unwrap();
+    let network = load(&tiny(), &[], FcgfConfig { voxel: 1.0, ..tiny() }).unwrap();
     let kept = network.run(&points(&scaled)).unwrap().kept;
     assert!(kept == golden.array("in.sel").usize());
 }
@@ -106,13 +108,13 @@ fn the_first_point_of_every_voxel_is_kept() {
 fn kernels_with_a_leading_one_are_read_and_sizes_come_from_the_weights() {
     let Some(golden) = GoldenTensors::open("backbones/fcgf_tiny.safetensors") else { return };
     let config = FcgfConfig { features: 16, ..tiny() };
-    let new = Fcgf::load(&weights(&config, &[]), FcgfConfig::three_d_match()).unwrap();
-    let old = Fcgf::load(&weights(&config, &[1]), FcgfConfig::three_d_match()).unwrap();
+    let new = load(&config, &[], FcgfConfig::three_d_match()).unwrap();
+    let old = load(&config, &[1], FcgfConfig::three_d_match()).unwrap();
     let cloud = &centres(&golden)[..300];
     let output = old.run(cloud).unwrap();
     assert_eq!(output.features.columns(), 16);
     assert!(output == new.run(cloud).unwrap());
-    let error = Fcgf::load(&weights(&config, &[1, 1]), config).err().unwrap().to_string();
+    let error = load(&config, &[1, 1], config.clone()).err().unwrap().to_string();
     assert!(error.contains("not the weights of FCGF"), "{error}");
 }
 
@@ -121,7 +123,7 @@ fn two_clouds_are_described_whatever_the_number_of_threads() {
     let Some(golden) = GoldenTensors::open("backbones/fcgf_tiny.safetensors") else { return };
     let mut config = tiny();
     config.ransac.inlier_threshold = 0.15;
-    let network = Fcgf::load(&weights(&config, &[]), config).unwrap();
+    let network = load(&config, &[], config.clone()).unwrap();
     let source = centres(&golden);
     let target = moved(&source);
     let selection = Selection { count: 900, ..Selection::default() };
@@ -134,7 +136,7 @@ fn two_clouds_are_described_whatever_the_number_of_threads() {
 
 #[test]
 fn clouds_that_cannot_be_described_are_refused() {
-    let network = Fcgf::load(&weights(&tiny(), &[]), tiny()).unwrap();
+    let network = load(&tiny(), &[], tiny()).unwrap();
     let refused = |cloud: &[Point3<f64>]| network.run(cloud).err().unwrap().to_string();
     assert!(refused(&[]).contains("has none"));
     assert!(refused(&[Point3::new(0.0, f64::NAN, 0.0)]).contains("NaN"));

@@ -1,58 +1,79 @@
-//! Weights that follow from their names, and lists of the tensors of official checkpoints.
+//! Weights by a formula: a hash of the name of a tensor and the place of a number in it.
 
-use std::collections::BTreeMap;
+use std::path::Path;
 
 use rare_nets::checkpoint::{Layout, Parameters};
 
-use crate::shared;
-
-/// Uniform numbers in -1..1 that depend on a tensor's name alone.
-pub(crate) fn uniform(name: &str, count: usize) -> Vec<f32> {
-    let seed = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
+/// Numbers from -1 to 1 that single precision holds exactly.
+pub(super) fn uniform(name: &str, count: usize) -> impl Iterator<Item = f64> {
+    let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3)
     });
-    let number = |index: u64| {
-        let step = (index + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        let mut bits = seed.wrapping_add(step);
-        bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        bits ^= bits >> 31;
-        ((bits >> 40) as f64 / f64::from(1 << 23) - 1.0) as f32
-    };
-    (0..count as u64).map(number).collect()
+    (1..=count as u64).map(move |place| {
+        let mut z = hash.wrapping_add(place.wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^= z >> 31;
+        (z >> 40) as f64 / 8_388_608.0 - 1.0
+    })
 }
 
-/// Opens `F32` tensors as a file would give them. The file is left to the system: it is read when it is asked for.
-pub(crate) fn open_tensors(tensors: &[(String, Vec<usize>, Vec<f32>)]) -> Parameters {
-    let mut header = BTreeMap::new();
-    let mut data: Vec<u8> = Vec::new();
-    for (name, shape, values) in tensors {
-        assert_eq!(shape.iter().product::<usize>(), values.len(), "{name}");
-        let begin = data.len();
-        data.extend(values.iter().flat_map(|value| value.to_le_bytes()));
+/// The numbers of a tensor; `None` for kernel points, which have no formula.
+pub(super) fn values(name: &str, shape: &[usize]) -> Option<Vec<f32>> {
+    let count = shape.iter().product();
+    let spread = |center: f64, width: f64| -> Option<Vec<f32>> {
+        Some(uniform(name, count).map(|u| (center + width * u) as f32).collect())
+    };
+    if name.ends_with("kernel_points") {
+        None
+    } else if name.ends_with("div_term") {
+        let term =
+            |place: usize| (-(2.0 * place as f64) * 10_000_f64.ln() / (2 * count) as f64).exp();
+        Some((0..count).map(|place| term(place) as f32).collect())
+    } else if name.ends_with("alpha") {
+        Some(vec![1.0])
+    } else if name.ends_with("bias") {
+        spread(0.0, 0.1)
+    } else if name.ends_with("norm.weight") {
+        spread(1.0, 0.2)
+    } else if let [_, inputs, _] = shape {
+        spread(0.0, (3.0 / *inputs as f64).sqrt())
+    } else {
+        let gain = if name.contains("decoder2") { 4.0 } else { 1.0 };
+        spread(0.0, gain * (3.0 / shape[1] as f64).sqrt())
+    }
+}
+
+/// A weight file of this layout in `folder`; `kernel_points` gives those of each convolution.
+pub(super) fn parameters(
+    folder: &Path,
+    layout: &Layout,
+    kernel_points: impl Fn(&str) -> Vec<f32>,
+) -> Parameters {
+    let tensor = |(name, shape): (&String, &Vec<usize>)| {
+        let numbers = values(name, shape).unwrap_or_else(|| kernel_points(name));
+        (name.clone(), shape.clone(), numbers)
+    };
+    open_tensors(folder, &layout.iter().map(tensor).collect::<Vec<_>>())
+}
+
+/// A weight file of these tensors in `folder`.
+pub(super) fn open_tensors(
+    folder: &Path,
+    tensors: &[(String, Vec<usize>, Vec<f32>)],
+) -> Parameters {
+    let (mut header, mut data) = (serde_json::Map::new(), Vec::new());
+    for (name, shape, numbers) in tensors {
+        let start = data.len();
+        data.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
         let entry = serde_json::json!({
-            "dtype": "F32", "shape": shape, "data_offsets": [begin, data.len()]
+            "dtype": "F32", "shape": shape, "data_offsets": [start, data.len()]
         });
-        header.insert(name, entry);
+        header.insert(name.clone(), entry);
     }
     let header = serde_json::to_vec(&header).unwrap();
-    let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
-    bytes.extend(header);
-    bytes.extend(data);
-    let path = tempfile::tempdir().unwrap().keep().join("weights.safetensors");
-    std::fs::write(&path, bytes).unwrap();
-    Parameters::open(&path).unwrap()
-}
-
-/// The tensors of an official checkpoint: `golden/backbones/<name>.state_dict.txt`.
-pub(crate) fn official_layout(name: &str) -> Option<Layout> {
-    let path = shared::path(&format!("golden/backbones/{name}.state_dict.txt"))?;
-    let text = std::fs::read_to_string(path).unwrap();
-    let entry = |line: &str| {
-        let (name, shape) = line.split_once(char::is_whitespace).unwrap();
-        let sizes = shape.trim().trim_matches(['(', ')']).split(',');
-        let sizes = sizes.map(str::trim).filter(|size| !size.is_empty());
-        (name.to_owned(), sizes.map(|size| size.parse().unwrap()).collect())
-    };
-    Some(text.lines().filter(|line| !line.trim().is_empty()).map(entry).collect())
+    let file = folder.join("formula.safetensors");
+    let length = (header.len() as u64).to_le_bytes();
+    std::fs::write(&file, [&length[..], &header, &data].concat()).unwrap();
+    Parameters::open(&file).unwrap()
 }

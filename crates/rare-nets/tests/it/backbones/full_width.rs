@@ -1,10 +1,11 @@
 //! What networks of the published widths cost: run by hand, one at a time, with `--ignored --nocapture`.
 
 use std::fs;
+use std::path::Path;
 
 use rare::nalgebra::Point3;
 use rare_nets::backbones::cofinet::{self, CoFiNet, CoFiNetConfig};
-use rare_nets::backbones::fcgf::{Fcgf, FcgfConfig};
+use rare_nets::backbones::fcgf::FcgfConfig;
 use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid};
 use rare_nets::backbones::predator::{self, Predator, PredatorConfig};
 use rare_nets::backbones::{Description, Selection};
@@ -51,7 +52,7 @@ fn measured<T>(what: &str, work: impl FnOnce() -> T) -> T {
 fn fcgf_on_rooms() {
     let Some([source, target]) = rooms() else { return };
     let config = FcgfConfig::three_d_match();
-    let network = Fcgf::load(&super::fcgf::weights(&config, &[]), config).unwrap();
+    let network = super::fcgf::load(&config, &[], config.clone()).unwrap();
     measured("fcgf: source alone", || network.run(&source).unwrap());
     let selection = Selection { count: 5000, ..Selection::default() };
     let description =
@@ -70,9 +71,10 @@ fn say(description: &Description) {
 }
 
 /// Weights by the formula: uniform, as large as keeps the scale of activations; kernel points on a sphere.
-fn weights(layout: &Layout, kernel_radius: f32) -> Parameters {
+fn weights(folder: &Path, layout: &Layout, kernel_radius: f32) -> Parameters {
     let tensor = |(name, shape): (&String, &Vec<usize>)| {
-        let mut values = uniform(name, shape.iter().product());
+        let mut values: Vec<f32> =
+            uniform(name, shape.iter().product()).map(|value| value as f32).collect();
         let factor = match shape.as_slice() {
             [_, inputs, _] if name.ends_with("KPConv.weights") => (3.0 / *inputs as f32).sqrt(),
             [_, 3] => kernel_radius,
@@ -89,7 +91,7 @@ fn weights(layout: &Layout, kernel_radius: f32) -> Parameters {
         }
         (name.clone(), shape.clone(), values)
     };
-    open_tensors(&layout.iter().map(tensor).collect::<Vec<_>>())
+    open_tensors(folder, &layout.iter().map(tensor).collect::<Vec<_>>())
 }
 
 #[test]
@@ -97,7 +99,9 @@ fn weights(layout: &Layout, kernel_radius: f32) -> Parameters {
 fn cofinet_on_rooms() {
     let Some([source, target]) = rooms() else { return };
     let config = CoFiNetConfig::three_d_match();
-    let network = CoFiNet::load(&weights(&cofinet::layout(&config), 0.0625), config).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let network =
+        CoFiNet::load(&weights(folder.path(), &cofinet::layout(&config), 0.0625), config).unwrap();
     let (limits, selection) =
         (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
     let expected = network.expected_bytes(&source, &target, &limits).unwrap() >> 20;
@@ -134,7 +138,10 @@ fn cofinet_on_rooms() {
 fn predator_on_rooms() {
     let Some([source, target]) = rooms() else { return };
     let config = PredatorConfig::three_d_match();
-    let network = Predator::load(&weights(&predator::layout(&config), 0.0625), config).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let network =
+        Predator::load(&weights(folder.path(), &predator::layout(&config), 0.0625), config)
+            .unwrap();
     let (limits, selection) =
         (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
     let expected = network.expected_bytes(&source, &target, &limits).unwrap() >> 20;

@@ -5,9 +5,9 @@ use rare_nets::backbones::Selection;
 use rare_nets::backbones::kpconv::{NeighbourLimits, PyramidConfig};
 use rare_nets::backbones::predator::{Predator, PredatorConfig, layout};
 
-use super::formula::official_layout;
 use super::recorded::{
-    TOLERANCE, clouds, compare, compare_change, described, finds_the_step, moved, pyramid, weights,
+    TOLERANCE, clouds, compare, compare_change, described, finds_the_step, moved, official_layout,
+    pyramid, weights,
 };
 use crate::shared::{GoldenTensors, relative_difference};
 

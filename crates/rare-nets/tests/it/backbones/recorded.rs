@@ -5,7 +5,7 @@ use rare::{Correspondence, RigidTransform};
 use rare_nets::Matrix;
 use rare_nets::backbones::Description;
 use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid, PyramidConfig};
-use rare_nets::checkpoint::Parameters;
+use rare_nets::checkpoint::{Layout, Parameters};
 
 use super::kpconv::golden_pyramid;
 use crate::shared::{self, GoldenTensors, relative_difference};
@@ -93,4 +93,17 @@ pub(crate) fn compare(golden: &GoldenTensors, name: &str, features: &Matrix) {
 pub(crate) fn compare_change(golden: &GoldenTensors, name: &str, after: &Matrix, before: &Matrix) {
     let values = after.values().iter().zip(before.values()).map(|(a, b)| a - b).collect();
     compare(golden, name, &Matrix::new(after.rows(), after.columns(), values).unwrap());
+}
+
+/// The tensors of an official checkpoint: `golden/backbones/<name>.state_dict.txt`.
+pub(crate) fn official_layout(name: &str) -> Option<Layout> {
+    let path = shared::path(&format!("golden/backbones/{name}.state_dict.txt"))?;
+    let text = std::fs::read_to_string(path).unwrap();
+    let entry = |line: &str| {
+        let (name, shape) = line.split_once(char::is_whitespace).unwrap();
+        let sizes = shape.trim().trim_matches(['(', ')']).split(',');
+        let sizes = sizes.map(str::trim).filter(|size| !size.is_empty());
+        (name.to_owned(), sizes.map(|size| size.parse().unwrap()).collect())
+    };
+    Some(text.lines().filter(|line| !line.trim().is_empty()).map(entry).collect())
 }
