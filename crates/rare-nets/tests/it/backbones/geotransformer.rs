@@ -10,7 +10,9 @@ use rare_nets::backbones::geotransformer::{
     FineMatchingConfig, GeoTransformer, GeoTransformerConfig, Partition, PointMatch, Registration,
     SuperpointMatch, TransformerConfig, layout, match_points,
 };
-use rare_nets::backbones::kpconv::{NeighbourLimits, Point, Pyramid, PyramidConfig, subsample};
+use rare_nets::backbones::kpconv::{
+    NeighbourLimits, Point, Pyramid, PyramidConfig, StagePoints, subsample,
+};
 use rare_nets::checkpoint::Parameters;
 
 use super::formula;
@@ -300,7 +302,7 @@ fn clouds_are_described_by_their_best_correspondences() {
     let Some((case, [source, target])) = tiny_clouds() else { return };
     let all = Selection { count: 10_000, ..Selection::default() };
     let found = case.network.describe(&source, &target, &case.limits, &all).unwrap();
-    case.compare_correspondences("described", &found.correspondences);
+    assert_eq!(case.compare_correspondences("described", &found.correspondences), 0);
     assert!(found.correspondences.is_sorted_by(|a, b| a.score >= b.score));
     assert!(found.warnings.is_empty(), "{:?}", found.warnings);
     // Random weights: nothing that means anything.
@@ -346,16 +348,25 @@ fn clouds_are_thinned_and_shifted_as_the_network_wants_them() {
         case.network.describe(source, target, &case.limits, &all)
     };
     // Thinned clouds are left alone wherever their grid begins.
-    let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
-    for step in 0..27 {
-        let [x, y, z] = [step % 3, step / 3 % 3, step / 9].map(|third| third as f32 / 30.0);
-        let points: Vec<Point> =
-            target.iter().map(|p| [p.x as f32 + x, p.y as f32 + y, p.z as f32 + z]).collect();
-        let ratio = points.len() as f64 / subsample(&points, 0.1).unwrap().len() as f64;
-        (least, most) = (least.min(ratio), most.max(ratio));
+    let full = GoldenTensors::open("backbones/geotransformer_full3dmatch.safetensors").unwrap();
+    let official = golden_points(&full, 0);
+    let tiny = golden_points(&case.golden, 0);
+    for (cloud, voxel) in
+        [(tiny.clouds()[0], 0.1), (official.clouds()[0], 0.025), (official.clouds()[1], 0.025)]
+    {
+        let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+        for step in 0..27 {
+            let offset = [step % 3, step / 3 % 3, step / 9].map(|third| third as f32 / 3.0 * voxel);
+            let points: Vec<Point> = cloud
+                .iter()
+                .map(|point| [0, 1, 2].map(|axis| point[axis] + offset[axis]))
+                .collect();
+            let ratio = points.len() as f64 / subsample(&points, voxel).unwrap().len() as f64;
+            (least, most) = (least.min(ratio), most.max(ratio));
+        }
+        println!("points per voxel of a cloud thinned to {voxel} m: {least:.2} to {most:.2}");
+        assert!(most < 2.0);
     }
-    println!("points per voxel of a thinned cloud: {least:.2} to {most:.2}");
-    assert!(most < 1.7);
     // Denser clouds are thinned.
     let dense = |cloud: &[Point3<f64>]| -> Vec<Point3<f64>> {
         let copies = |point: &Point3<f64>| [0.0, 0.001, -0.001].map(|step| point.map(|x| x + step));
@@ -419,8 +430,9 @@ impl Case {
         self.compare_structure(name, &pyramid);
         let found = self.network.register(&pyramid, &mut watch).unwrap();
         self.compare_features(name, &found);
-        self.compare_partitions(name, &found);
-        self.compare_matches(name, &found, &pyramid);
+        let undecided = self.compare_partitions(name, &found);
+        assert!(undecided.len() <= 6, "{undecided:?}");
+        self.compare_matches(name, &found, &pyramid, &undecided);
         compared
     }
 }
@@ -468,8 +480,12 @@ impl Case {
         }
     }
 
-    /// Patches hold the same points; near-equal distances may change their order, and which is last.
-    fn compare_partitions(&self, name: &str, found: &Registration) {
+    /// Patches hold the same points; near-equal distances may change their order. Gives those (side, superpoint) with a
+    /// point that could as well belong to another.
+    fn compare_partitions(&self, name: &str, found: &Registration) -> BTreeSet<(usize, usize)> {
+        let stages: Vec<StagePoints> =
+            (0..4).map(|stage| golden_points(&self.golden, stage)).collect();
+        let mut undecided = BTreeSet::new();
         for (side, part) in both("part.*_node_knn_").iter().enumerate() {
             let indices = self.golden.array(&format!("{part}indices"));
             let masks = self.golden.array(&format!("{part}masks"));
@@ -484,13 +500,27 @@ impl Case {
                 swapped += usize::from(&golden != patch);
                 let sets =
                     [patch, &golden].map(|list| list.iter().copied().collect::<BTreeSet<u32>>());
-                assert_eq!(sets[0], sets[1], "{name} {part} {node}");
+                for &point in sets[0].symmetric_difference(&sets[1]) {
+                    // A point as far from one superpoint as from another may go to either.
+                    let superpoints = stages[3].clouds()[side];
+                    let point = &stages[1].clouds()[side][point as usize];
+                    assert!(is_tie(point, superpoints), "{name} {part} {node} {point:?}");
+                    undecided.insert((side, node));
+                }
             }
             println!("{name} {part}: {swapped} of {} rows in another order", indices.shape[0]);
         }
+        println!("{name} partition: {} undecided patches", undecided.len());
+        undecided
     }
 
-    fn compare_matches(&self, name: &str, found: &Registration, pyramid: &Pyramid) {
+    fn compare_matches(
+        &self,
+        name: &str,
+        found: &Registration,
+        pyramid: &Pyramid,
+        undecided: &BTreeSet<(usize, usize)>,
+    ) {
         let golden = both("out.*_node_corr_indices").map(|part| self.golden.array(&part).usize());
         let pairs = found.superpoint_matches.iter().map(|pair| (pair.target, pair.source));
         let golden: Vec<(usize, usize)> =
@@ -500,16 +530,30 @@ impl Case {
         println!("{name} superpoint matches: {moved} of {} at another place", golden.len());
         let sets = [&pairs, &golden].map(|list| list.iter().copied().collect::<BTreeSet<_>>());
         assert_eq!(sets[0], sets[1], "{name}");
-        self.compare_plans(name, found, &golden);
+        self.compare_plans(name, found, &golden, undecided);
         let (correspondences, groups) = found.correspondences(pyramid);
-        self.compare_correspondences(name, &correspondences);
+        if undecided.is_empty() {
+            assert_eq!(self.compare_correspondences(name, &correspondences), 0, "{name}");
+        } else {
+            let different = self.compare_correspondences(name, &correspondences);
+            assert!(different * 100 <= correspondences.len(), "{name}: {different}");
+            if different > 0 {
+                return;
+            }
+        }
         let rule = self.config.fine.local_to_global();
         let pose = rule.most_agreed(&correspondences, &groups).unwrap().target_from_source;
         compare_pose(name, &pose, &self.golden.array("out.estimated_transform").values);
     }
 
     /// Entries of points that there are; order within a patch as in the golden file.
-    fn compare_plans(&self, name: &str, found: &Registration, golden_pairs: &[(usize, usize)]) {
+    fn compare_plans(
+        &self,
+        name: &str,
+        found: &Registration,
+        golden_pairs: &[(usize, usize)],
+        undecided: &BTreeSet<(usize, usize)>,
+    ) {
         let first = self.golden.contains("out.matching_scores");
         let part = if first { "out.matching_scores" } else { "out.matching_scores_first32" };
         let scores = self.golden.array(part);
@@ -518,6 +562,9 @@ impl Case {
         let (mut worst, mut largest): (f64, f64) = (0.0, 0.0);
         for (patch, plan) in scores.values.chunks_exact(height * width).enumerate() {
             let pair = golden_pairs[patch];
+            if undecided.contains(&(0, pair.0)) || undecided.contains(&(1, pair.1)) {
+                continue;
+            }
             let ours = found.superpoint_matches.iter().position(|m| (m.target, m.source) == pair);
             let ours = &found.plans[ours.unwrap()];
             let place = |side: usize, node: usize, slot: usize| {
@@ -545,8 +592,8 @@ impl Case {
         assert!(worst / largest < TOLERANCE, "{name}: {worst} of {largest}");
     }
 
-    /// The same pairs of points, whose scores are close.
-    fn compare_correspondences(&self, name: &str, found: &[Correspondence]) {
+    /// The same pairs of points, whose scores are close. Gives the number of those that only one side has.
+    fn compare_correspondences(&self, name: &str, found: &[Correspondence]) -> usize {
         let points = both("out.*_corr_points").map(|part| self.golden.array(&part).f32());
         let scores = self.golden.array("out.corr_scores").values;
         let bits = |point: &[f32]| -> [u32; 3] { [0, 1, 2].map(|axis| point[axis].to_bits()) };
@@ -569,9 +616,21 @@ impl Case {
             "{name} correspondences: {missing} missing, {surplus} surplus of {}; scores {difference:.1e}",
             golden.len()
         );
-        assert_eq!((missing, surplus, found.len()), (0, 0, scores.len()), "{name}");
+        assert!(found.len().abs_diff(scores.len()) <= missing.max(surplus), "{name}");
         assert!(difference < 1e-3, "{name}: {difference}");
+        missing + surplus
     }
+}
+
+/// Whether the two superpoints nearest to a point are equally far, up to the rounding of the released code, which computes
+/// squared distances (square metres) as differences of squares.
+fn is_tie(point: &Point, superpoints: &[Point]) -> bool {
+    let squared = |other: &Point| {
+        (0..3).map(|axis| f64::from(point[axis] - other[axis]).powi(2)).sum::<f64>()
+    };
+    let mut distances: Vec<f64> = superpoints.iter().map(squared).collect();
+    distances.sort_by(f64::total_cmp);
+    distances[1] - distances[0] < 1e-5
 }
 
 fn compare_pose(name: &str, pose: &RigidTransform, golden: &[f64]) {
