@@ -1,6 +1,9 @@
 //! Networks on points against recorded stages of other implementations.
 
+mod case;
+mod clouds;
 mod cofinet;
+mod comparison;
 mod fcgf;
 mod formula;
 mod full_width;
