@@ -121,9 +121,8 @@ impl Backbone {
             }
             (None, TrainedOn::ThreeDMatch) if published.0.len() == config.stages => published,
             (None, _) => {
-                let step = config.voxel(config.stages);
-                let of = |points| sampled(points, config.voxel, step);
-                let pair = [of(clouds[0])?, of(clouds[1])?];
+                let pair =
+                    [sampled(clouds[0], "source", config)?, sampled(clouds[1], "target", config)?];
                 calibrate([pair.each_ref().map(|cloud| cloud.points.as_slice())], config)?
             }
         }))

@@ -66,15 +66,7 @@ impl GeoTransformer {
 
     /// Target and source as the network wants them.
     fn sampled(&self, source: &[Point3<f64>], target: &[Point3<f64>]) -> Result<[Sampled; 2]> {
-        let pyramid = &self.config.pyramid;
-        let of = |points: &[Point3<f64>], name: &str| {
-            sampled(points, pyramid.voxel, pyramid.voxel(pyramid.stages)).map_err(|error| {
-                match error {
-                    Error::InvalidInput(what) => Error::invalid(format!("the {name}: {what}")),
-                    other => other,
-                }
-            })
-        };
+        let of = |points, name| sampled(points, name, &self.config.pyramid);
         Ok([of(target, "target")?, of(source, "source")?])
     }
 

@@ -1,7 +1,7 @@
 //! Clouds made ready for a network.
 
+use rare::Result;
 use rare::nalgebra::Point3;
-use rare::{Error, Result};
 
 use super::EncoderSizes;
 use crate::backbones::kpconv::{
@@ -26,14 +26,7 @@ impl Prepared {
         target: &[Point3<f64>],
         config: &PyramidConfig,
     ) -> Result<Prepared> {
-        let of = |points: &[Point3<f64>], name: &str| {
-            sampled(points, config.voxel, config.voxel(config.stages)).map_err(
-                |error| match error {
-                    Error::InvalidInput(what) => Error::invalid(format!("the {name}: {what}")),
-                    other => other,
-                },
-            )
-        };
+        let of = |points, name| sampled(points, name, config);
         let clouds = [of(source, "source")?, of(target, "target")?];
         let stages =
             StagePoints::new(clouds.each_ref().map(|cloud| cloud.points.as_slice()), config)?;

@@ -74,6 +74,25 @@ pub fn calibrate<'a>(
     Ok(NeighbourLimits(limits))
 }
 
+/// How many neighbours four fifths of the points of a cloud have at most within `radius` metres, themselves included; 0
+/// without points. Some thousand points are asked, spread evenly over their order.
+///
+/// # Errors
+/// `InvalidInput` if a point is not finite or the cloud spans too much for the radius.
+pub(in crate::backbones) fn usual_neighbours(points: &[Point], radius: f32) -> Result<usize> {
+    let cells = Cells::new(points, radius, 0)?;
+    let step = (points.len() / SAMPLED as usize).max(1);
+    let count = |found: &mut Vec<u64>, index: usize| {
+        cells.within(&points[index], found);
+        found.len()
+    };
+    let asked: Vec<usize> = (0..points.len()).step_by(step).collect();
+    let mut counts: Vec<usize> = asked.into_par_iter().map_init(Vec::new, count).collect();
+    counts.sort_unstable();
+    let place = (KEPT * counts.len() as f64) as usize;
+    Ok(counts.get(place).or(counts.last()).copied().unwrap_or(0))
+}
+
 /// How many neighbours each point of a stage has, itself included.
 fn counts(stage: &StagePoints, radius: f32) -> Result<Vec<usize>> {
     let (first, second) = stage.points.split_at(stage.lengths[0]);

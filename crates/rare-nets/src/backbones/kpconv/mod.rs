@@ -24,6 +24,7 @@ mod pyramid;
 
 pub(crate) use blocks::{ConvolutionBlock, NormalizationKind, ResidualBlock, Unary, upsample};
 pub use grid_subsampling::subsample;
+pub(in crate::backbones) use limits::usual_neighbours;
 pub use limits::{NeighbourLimits, calibrate};
 pub use memory::{expected_counts, pyramid_bytes};
 pub use neighbours::{Neighbours, neighbours};

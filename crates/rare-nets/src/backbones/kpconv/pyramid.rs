@@ -37,6 +37,14 @@ impl PyramidConfig {
         self.sigma * self.voxel(stage)
     }
 
+    /// How many neighbours four fifths of the points of stage 0 had at most in the training data: the first neighbour limit
+    /// of the released networks. That for streets was never published; it is what a public evaluation of the released
+    /// `GeoTransformer` uses.
+    pub(in crate::backbones) fn trained_neighbours(&self) -> f64 {
+        let is_outdoors = self.radius > 3.0;
+        if is_outdoors { 64.0 } else { 38.0 }
+    }
+
     /// One for each voxel within the radius and one voxel more: as many neighbours as a point can have.
     #[must_use]
     pub fn most_neighbours(&self) -> usize {

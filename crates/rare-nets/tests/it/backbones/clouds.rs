@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use rare::Correspondence;
 use rare::nalgebra::{Point3, Vector3};
 use rare_nets::backbones::Selection;
-use rare_nets::backbones::kpconv::{NeighbourLimits, Point, subsample};
+use rare_nets::backbones::kpconv::{NeighbourLimits, Point};
 
 use super::case::Case;
 use super::kpconv::golden_points;
-use crate::shared::{GoldenTensors, relative_difference};
+use crate::shared::relative_difference;
 
 /// The tiny network and the clouds of its golden file, source first.
 fn tiny_clouds() -> Option<(Case, [Vec<Point3<f64>>; 2])> {
@@ -71,26 +71,6 @@ fn clouds_are_thinned_and_shifted_as_the_network_wants_them() {
     let describe = |source: &[Point3<f64>], target: &[Point3<f64>]| {
         case.network.describe(source, target, &case.limits, &all)
     };
-    // Thinned clouds are left alone wherever their grid begins.
-    let full = GoldenTensors::open("backbones/geotransformer_full3dmatch.safetensors").unwrap();
-    let official = golden_points(&full, 0);
-    let tiny = golden_points(&case.golden, 0);
-    for (cloud, voxel) in
-        [(tiny.clouds()[0], 0.1), (official.clouds()[0], 0.025), (official.clouds()[1], 0.025)]
-    {
-        let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
-        for step in 0..27 {
-            let offset = [step % 3, step / 3 % 3, step / 9].map(|third| third as f32 / 3.0 * voxel);
-            let points: Vec<Point> = cloud
-                .iter()
-                .map(|point| [0, 1, 2].map(|axis| point[axis] + offset[axis]))
-                .collect();
-            let ratio = points.len() as f64 / subsample(&points, voxel).unwrap().len() as f64;
-            (least, most) = (least.min(ratio), most.max(ratio));
-        }
-        println!("points per voxel of a cloud thinned to {voxel} m: {least:.2} to {most:.2}");
-        assert!(most < 2.0);
-    }
     // Denser clouds are thinned.
     let dense = |cloud: &[Point3<f64>]| -> Vec<Point3<f64>> {
         let copies = |point: &Point3<f64>| [0.0, 0.001, -0.001].map(|step| point.map(|x| x + step));
