@@ -1,7 +1,7 @@
 //! CPU time and peak memory of the networks that tell right correspondences from wrong ones:
-//! `outlier_speed pointdsc|vbreg WEIGHTS COUNT`.
+//! `outlier_speed pointdsc|vbreg WEIGHTS COUNT [RIGHT]`.
 //!
-//! The pairs are random points of a room of 4 m, a tenth of them right; Linux only.
+//! The pairs are random points of a room of 4 m, the share RIGHT (0.1) of them right; Linux only.
 #![expect(clippy::print_stdout, reason = "the result")]
 
 use std::error::Error;
@@ -17,11 +17,12 @@ use rare_nets::outliers::{PointDsc, PointDscConfig, Vbreg, VbregConfig};
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let [network, weights, count] = arguments.as_slice() else {
-        return Err("outlier_speed pointdsc|vbreg WEIGHTS COUNT".into());
+    let [network, weights, count, right @ ..] = arguments.as_slice() else {
+        return Err("outlier_speed pointdsc|vbreg WEIGHTS COUNT [RIGHT]".into());
     };
     let parameters = Parameters::open(Path::new(weights))?;
-    let pairs = pairs(count.parse()?);
+    let right: f64 = right.first().map_or(Ok(0.1), |right| right.parse())?;
+    let pairs = pairs(count.parse()?, right);
     let estimator: Box<dyn PoseEstimator> = match network.as_str() {
         "pointdsc" => {
             Box::new(PointDsc::load(&parameters, PointDscConfig::three_d_match(Mode::Fixed))?)
@@ -45,7 +46,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-fn pairs(count: usize) -> Vec<Correspondence> {
+fn pairs(count: usize, right: f64) -> Vec<Correspondence> {
     let motion = RigidTransform::new(Rotation3::new(Vector3::new(0.4, -0.2, 0.9)), Vector3::x());
     let mut random = Random::new(1, 0);
     let mut vector = |size: f64| Vector3::from_fn(|_, _| size * (random.uniform() - 0.5));
@@ -53,7 +54,9 @@ fn pairs(count: usize) -> Vec<Correspondence> {
         .map(|i| {
             let source = Point3::from(vector(4.0));
             let other = Point3::from(vector(4.0));
-            let target = motion.apply(if i % 10 == 0 { &source } else { &other }) + vector(0.05);
+            let target =
+                motion.apply(if (i as f64) < right * count as f64 { &source } else { &other })
+                    + vector(0.05);
             Correspondence { source, target, score: 1.0 }
         })
         .collect()

@@ -22,7 +22,7 @@ pub(crate) use rows::{AlignedRows, Columns, FactorRows, ScoreFactors};
 use softmax::{Total, exponentiate, scores};
 
 /// Queries of a block, and so of the rows that [`ScoreFactors`] gives at once.
-pub(crate) const QUERIES: usize = 128;
+pub(crate) const QUERIES: usize = 256;
 /// Products that are summed up side by side.
 const BATCH: usize = 4;
 

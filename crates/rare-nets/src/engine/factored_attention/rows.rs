@@ -11,7 +11,7 @@ use super::super::simd::LANES;
 use crate::Matrix;
 
 /// Keys whose channels stay in the second-level cache while all queries of a block pass by.
-pub(super) const KEYS: usize = 512;
+pub(super) const KEYS: usize = 256;
 
 /// The factors of the scores between queries and keys.
 pub(crate) trait ScoreFactors: Sync {
