@@ -9,16 +9,19 @@ use super::kpconv::{Point, subsample};
 /// A cloud with more points than this for each occupied voxel is thinned.
 ///
 /// One that was thinned already has 1 if its grid was the same, and more if it was shifted against ours, because
-/// barycentres of neighbouring voxels then share one of ours: up to 1.4 in rooms. One whose points are half as far apart
-/// has 3 to 4, and surfaces seen from close by have tens.
-const DENSE: f64 = 1.7;
+/// barycentres of neighbouring voxels then share one of ours: up to 1.8 in rooms. One whose points are half as far apart
+/// has at least 3.6, and surfaces seen from close by have tens.
+const DENSE: f64 = 2.5;
 
 /// Coordinates beyond so many voxels are brought near the origin: single precision then rounds by less than a
 /// thousandth of a voxel.
 const FAR: f64 = 4096.0;
 
-/// Spacings differ from those of the training data if they are so many times larger.
+/// Points are too far apart if they are so many times farther apart than those of the training data.
 const WIDE: f64 = 2.0;
+
+/// The median distance to the nearest neighbour in a cloud that was thinned to voxels of 1 (0.53 in rooms).
+const NEAREST: f64 = 0.55;
 
 /// A cloud as a network takes it.
 pub(super) struct Sampled {
@@ -55,11 +58,12 @@ fn shift(points: &[Point3<f64>], voxel: f64, step: f64) -> Vector3<f64> {
 }
 
 impl Sampled {
-    /// What to say if the points are much farther apart than those that the network was trained on, `trained` metres.
+    /// What to say if the points are much farther apart than those that the network was trained on, which were thinned to
+    /// voxels of `trained` metres. Spacings are given as the voxels to which such clouds were thinned.
     pub(super) fn warning(&self, name: &str, trained: f64) -> Option<String> {
         let points: Vec<Point3<f64>> =
             self.points.iter().map(|point| Point3::from(point.map(f64::from))).collect();
-        let spacing = resolution(&points);
+        let spacing = resolution(&points) / NEAREST;
         (spacing > WIDE * trained).then(|| {
             format!("trained on points {trained} m apart, the {name}'s are {spacing:.2} m apart")
         })

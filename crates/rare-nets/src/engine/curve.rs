@@ -90,8 +90,8 @@ fn interpolate<S: Simd>(
     place: &Place,
 ) -> S::Floats {
     let mut sum = simd.mul(simd.load(&taps[0][at]), simd.splat(place.weights[0]));
-    for tap in 1..4 {
-        sum = simd.mul_add(simd.load(&taps[tap][at]), simd.splat(place.weights[tap]), sum);
+    for (tap, &weight) in taps.iter().zip(&place.weights).skip(1) {
+        sum = simd.mul_add(simd.load(&tap[at]), simd.splat(weight), sum);
     }
     sum
 }

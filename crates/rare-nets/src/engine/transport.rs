@@ -144,11 +144,11 @@ mod tests {
         let nu = |j: usize| if j < n { norm } else { (m as f64).ln() + norm };
         let (mut u, mut v) = (vec![0.0; m + 1], vec![0.0; n + 1]);
         for _ in 0..iterations {
-            for i in 0..=m {
-                u[i] = mu(i) - (0..=n).map(|j| (score(i, j) + v[j]).exp()).sum::<f64>().ln();
+            for (i, u) in u.iter_mut().enumerate() {
+                *u = mu(i) - (0..=n).map(|j| (score(i, j) + v[j]).exp()).sum::<f64>().ln();
             }
-            for j in 0..=n {
-                v[j] = nu(j) - (0..=m).map(|i| (score(i, j) + u[i]).exp()).sum::<f64>().ln();
+            for (j, v) in v.iter_mut().enumerate() {
+                *v = nu(j) - (0..=m).map(|i| (score(i, j) + u[i]).exp()).sum::<f64>().ln();
             }
         }
         let value = |at: usize| {

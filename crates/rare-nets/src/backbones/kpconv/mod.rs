@@ -1,4 +1,4 @@
-//! Kernel point convolutions (Thomas et al., "KPConv: Flexible and Deformable Convolution for Point Clouds", ICCV 2019)
+//! Kernel point convolutions (Thomas et al., "`KPConv`: Flexible and Deformable Convolution for Point Clouds", ICCV 2019)
 //! of two clouds together, as `GeoTransformer`, Predator and CoFiNet use them.
 //!
 //! | module | what it holds |

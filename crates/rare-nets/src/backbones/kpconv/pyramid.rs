@@ -146,6 +146,14 @@ impl Pyramid {
         limits: &NeighbourLimits,
     ) -> Result<Pyramid> {
         limits.validate(points.len())?;
+        for StagePoints { points, lengths: [first, second] } in &points {
+            if first.checked_add(*second) != Some(points.len()) {
+                return Err(Error::invalid(format!(
+                    "clouds of {first} and {second} points are not {} points together",
+                    points.len()
+                )));
+            }
+        }
         let near = |queries: &StagePoints, support: &StagePoints, level: usize, limit: usize| {
             let radius = config.radius(level) as f32;
             let lengths = [queries.lengths, support.lengths];
