@@ -79,7 +79,7 @@ impl Network {
 impl TrainedOn {
     /// By the spacing of the points, metres.
     pub(crate) fn from_voxel(voxel: f64) -> TrainedOn {
-        if voxel > 0.1 { TrainedOn::Kitti } else { TrainedOn::ThreeDMatch }
+        if voxel > 0.15 { TrainedOn::Kitti } else { TrainedOn::ThreeDMatch }
     }
 }
 

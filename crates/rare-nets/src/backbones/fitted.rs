@@ -111,8 +111,8 @@ fn first_radius(parameters: &Parameters, name: &str) -> Result<f64> {
 fn spaced(released: PyramidConfig, radius: f64) -> PyramidConfig {
     let voxel = radius / released.radius;
     let is_released = (voxel / released.voxel).ln().abs() < SNAP;
-    // Four digits: what the noise of the kernel points leaves.
-    let rounded = format!("{voxel:.3e}").parse().unwrap_or(voxel);
+    // Two digits: what the noise of the kernel points leaves.
+    let rounded = format!("{voxel:.1e}").parse().unwrap_or(voxel);
     PyramidConfig { voxel: if is_released { released.voxel } else { rounded }, ..released }
 }
 
