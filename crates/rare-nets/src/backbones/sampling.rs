@@ -74,16 +74,21 @@ fn shift(points: &[Point3<f64>], voxel: f64, step: f64) -> Vector3<f64> {
 }
 
 impl Sampled {
-    /// What to say if the points are much farther apart than those that the network was trained on, which were thinned to
-    /// voxels of `trained` metres. Spacings are given as the voxels to which such clouds were thinned.
+    /// That of [`warning`].
     pub(super) fn warning(&self, name: &str, trained: f64) -> Option<String> {
         let points: Vec<Point3<f64>> =
             self.points.iter().map(|point| Point3::from(point.map(f64::from))).collect();
-        let spacing = resolution(&points) / NEAREST;
-        (spacing > WIDE * trained).then(|| {
-            format!("trained on points {trained} m apart, the {name}'s are {spacing:.2} m apart")
-        })
+        warning(&points, name, trained)
     }
+}
+
+/// What to say if points are much farther apart than those that the network was trained on, which were thinned to voxels
+/// of `trained` metres. Spacings are given as the voxels to which such clouds were thinned.
+pub(super) fn warning(points: &[Point3<f64>], name: &str, trained: f64) -> Option<String> {
+    let spacing = resolution(points) / NEAREST;
+    (spacing > WIDE * trained).then(|| {
+        format!("trained on points {trained} m apart, the {name}'s are {spacing:.2} m apart")
+    })
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@ use rare::{PointFeatures, Result};
 
 use super::{Fcgf, FcgfConfig, Matching};
 use crate::backbones::consensus::{correspondences, for_target, pose};
-use crate::backbones::{Description, Keypoints, Selection, SelectionRule};
+use crate::backbones::{Description, Keypoints, Selection, SelectionRule, sampling};
 
 impl Fcgf {
     /// Describes two clouds: `selection.count` random keypoints on each side, because the network does not say which
@@ -25,10 +25,10 @@ impl Fcgf {
         selection: &Selection,
     ) -> Result<Description> {
         let (from, to) = rayon::join(
-            || self.keypoints(source, selection),
-            || self.keypoints(target, &for_target(selection)),
+            || self.keypoints("source", source, selection),
+            || self.keypoints("target", target, &for_target(selection)),
         );
-        let (from, to) = (from?, to?);
+        let ((from, of_source), (to, of_target)) = (from?, to?);
         let matches = self.config.matches(&from, &to)?;
         let pairs = correspondences(&from, &to, &matches, |pair| self.config.score(pair));
         let target_from_source = pose(&self.config.ransac, [source, target], &pairs, selection);
@@ -39,18 +39,26 @@ impl Fcgf {
             correspondences: pairs,
             target_from_source,
             neighbour_limits: None,
-            warnings: Vec::new(),
+            warnings: of_source.into_iter().chain(of_target).collect(),
         })
     }
 
-    /// Random voxels of a cloud.
-    fn keypoints(&self, points: &[Point3<f64>], selection: &Selection) -> Result<PointFeatures> {
+    /// Random voxels of a cloud, and what to say if its points are far apart.
+    fn keypoints(
+        &self,
+        name: &str,
+        points: &[Point3<f64>],
+        selection: &Selection,
+    ) -> Result<(PointFeatures, Option<String>)> {
         let output = self.run(points)?;
         let chance = Selection { rule: SelectionRule::Random, ..*selection };
         let chosen = chance.choose(&vec![1.0; output.kept.len()]);
-        let kept = output.kept.iter().filter_map(|&index| points.get(index)).copied().collect();
+        let kept = output.kept.iter().filter_map(|&index| points.get(index));
+        let kept: Vec<Point3<f64>> = kept.copied().collect();
+        let warning = sampling::warning(&kept, name, self.config.voxel);
         let dimension = output.features.columns();
-        Ok(PointFeatures::new(kept, dimension, output.features.into_values())?.select(&chosen))
+        let all = PointFeatures::new(kept, dimension, output.features.into_values())?;
+        Ok((all.select(&chosen), warning))
     }
 }
 

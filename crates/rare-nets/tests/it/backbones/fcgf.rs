@@ -144,5 +144,8 @@ fn clouds_that_cannot_be_described_are_refused() {
     let alone = [Point3::new(0.05, 0.05, 0.05)];
     assert_eq!(network.run(&alone).unwrap().features.rows(), 1);
     let description = network.describe(&alone, &alone, &Selection::default()).unwrap();
-    assert!(description.target_from_source.is_err());
+    assert!(description.target_from_source.is_err() && description.warnings.is_empty());
+    let sparse: Vec<_> = (0..9).map(|step| Point3::new(f64::from(step), 0.0, 0.0)).collect();
+    let warnings = network.describe(&sparse, &alone, &Selection::default()).unwrap().warnings;
+    assert!(warnings[0].contains("source's"), "{warnings:?}");
 }

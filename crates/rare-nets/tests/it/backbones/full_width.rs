@@ -6,7 +6,7 @@ use std::path::Path;
 use rare::nalgebra::Point3;
 use rare_nets::backbones::cofinet::{self, CoFiNet, CoFiNetConfig};
 use rare_nets::backbones::fcgf::FcgfConfig;
-use rare_nets::backbones::kpconv::{NeighbourLimits, Pyramid};
+use rare_nets::backbones::kpconv::NeighbourLimits;
 use rare_nets::backbones::predator::{self, Predator, PredatorConfig};
 use rare_nets::backbones::{Description, Selection};
 use rare_nets::checkpoint::{Layout, Parameters};
@@ -94,60 +94,73 @@ fn weights(folder: &Path, layout: &Layout, kernel_radius: f32) -> Parameters {
     open_tensors(folder, &layout.iter().map(tensor).collect::<Vec<_>>())
 }
 
+/// The clouds twelve times as large, with the spacing of the networks for streets.
+fn streets() -> Option<[Vec<Point3<f64>>; 2]> {
+    Some(rooms()?.map(|cloud| cloud.iter().map(|point| point * 12.0).collect()))
+}
+
+fn selection() -> Selection {
+    Selection { count: 5000, ..Selection::default() }
+}
+
+fn cofinet(
+    config: CoFiNetConfig,
+    limits: &NeighbourLimits,
+    [source, target]: [Vec<Point3<f64>>; 2],
+) {
+    let folder = tempfile::tempdir().unwrap();
+    let radius = config.pyramid.radius(0) as f32;
+    let parameters = weights(folder.path(), &cofinet::layout(&config), radius);
+    let network = CoFiNet::load(&parameters, config).unwrap();
+    let expected = network.expected_bytes(&source, &target, limits).unwrap() >> 20;
+    println!("expected: {expected} MB");
+    let description = measured("cofinet: pair", || {
+        network.describe(&source, &target, limits, &selection()).unwrap()
+    });
+    say(&description);
+}
+
+fn predator(
+    config: PredatorConfig,
+    limits: &NeighbourLimits,
+    [source, target]: [Vec<Point3<f64>>; 2],
+) {
+    let folder = tempfile::tempdir().unwrap();
+    let radius = config.pyramid.radius(0) as f32;
+    let parameters = weights(folder.path(), &predator::layout(&config), radius);
+    let network = Predator::load(&parameters, config).unwrap();
+    let expected = network.expected_bytes(&source, &target, limits).unwrap() >> 20;
+    println!("expected: {expected} MB");
+    let description = measured("predator: pair", || {
+        network.describe(&source, &target, limits, &selection()).unwrap()
+    });
+    say(&description);
+}
+
 #[test]
 #[ignore = "measures"]
 fn cofinet_on_rooms() {
-    let Some([source, target]) = rooms() else { return };
-    let config = CoFiNetConfig::three_d_match();
-    let folder = tempfile::tempdir().unwrap();
-    let network =
-        CoFiNet::load(&weights(folder.path(), &cofinet::layout(&config), 0.0625), config).unwrap();
-    let (limits, selection) =
-        (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
-    let expected = network.expected_bytes(&source, &target, &limits).unwrap() >> 20;
-    println!("expected: {expected} MB");
-    let description = measured("cofinet: pair", || {
-        network.describe(&source, &target, &limits, &selection).unwrap()
-    });
-    say(&description);
-    let narrow = |cloud: &[Point3<f64>]| -> Vec<[f32; 3]> {
-        cloud.iter().map(|point| [point.x as f32, point.y as f32, point.z as f32]).collect()
-    };
-    let clouds = [narrow(&source), narrow(&target)];
-    let sizes = network.config().pyramid;
-    let pyramid = measured("pyramid alone", || {
-        Pyramid::new([&clouds[0], &clouds[1]], &sizes, &limits).unwrap()
-    });
-    let output = measured("cofinet: network alone", || network.run(&pyramid).unwrap());
-    let lengths: Vec<_> = pyramid.stages.iter().map(|stage| stage.lengths).collect();
-    let sources: std::collections::BTreeSet<_> =
-        output.fine_pairs.iter().map(|p| p.source).collect();
-    let targets: std::collections::BTreeSet<_> =
-        output.fine_pairs.iter().map(|p| p.target).collect();
-    println!(
-        "{lengths:?}, {} coarse pairs, {} fine: {} {}",
-        output.coarse_pairs.len(),
-        output.fine_pairs.len(),
-        sources.len(),
-        targets.len()
-    );
+    let Some(clouds) = rooms() else { return };
+    cofinet(CoFiNetConfig::three_d_match(), &NeighbourLimits::three_d_match(), clouds);
+}
+
+#[test]
+#[ignore = "measures"]
+fn cofinet_on_streets() {
+    let Some(clouds) = streets() else { return };
+    cofinet(CoFiNetConfig::kitti(), &NeighbourLimits(vec![60, 80, 80, 80]), clouds);
 }
 
 #[test]
 #[ignore = "measures"]
 fn predator_on_rooms() {
-    let Some([source, target]) = rooms() else { return };
-    let config = PredatorConfig::three_d_match();
-    let folder = tempfile::tempdir().unwrap();
-    let network =
-        Predator::load(&weights(folder.path(), &predator::layout(&config), 0.0625), config)
-            .unwrap();
-    let (limits, selection) =
-        (NeighbourLimits::three_d_match(), Selection { count: 5000, ..Selection::default() });
-    let expected = network.expected_bytes(&source, &target, &limits).unwrap() >> 20;
-    println!("expected: {expected} MB");
-    let description = measured("predator: pair", || {
-        network.describe(&source, &target, &limits, &selection).unwrap()
-    });
-    say(&description);
+    let Some(clouds) = rooms() else { return };
+    predator(PredatorConfig::three_d_match(), &NeighbourLimits::three_d_match(), clouds);
+}
+
+#[test]
+#[ignore = "measures"]
+fn predator_on_streets() {
+    let Some(clouds) = streets() else { return };
+    predator(PredatorConfig::kitti(), &NeighbourLimits(vec![60, 80, 80, 80]), clouds);
 }
