@@ -20,7 +20,6 @@ pub mod cache;
 pub mod checkpoint;
 pub mod diffusion;
 pub mod engine;
-#[allow(dead_code)]
 mod layers;
 mod matrix;
 pub mod networks;
