@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::backbones::cofinet::{self, CoFiNetConfig};
 use crate::backbones::fcgf::{self, FcgfConfig};
 use crate::backbones::geotransformer::{self, GeoTransformerConfig};
+use crate::backbones::kpconv::PyramidConfig;
 use crate::backbones::predator::{self, PredatorConfig};
 use crate::backbones::{Backbone, fitted};
 use crate::checkpoint::{Differences, Layout, Parameters, compare};
@@ -161,57 +162,48 @@ pub fn identify(parameters: &Parameters) -> Option<Identity> {
     })
 }
 
-/// Every network, with the sizes that the weights would have if they were of it. Where even those cannot be told, they
-/// are of another one.
+/// Every network, with the sizes that the weights would have if they were of it; where not even those can be told, with
+/// those of the released one.
 fn candidates(parameters: &Parameters) -> Vec<Candidate> {
-    let backbones = [
-        fitted::geotransformer(parameters).ok().map(|config| geotransformer_candidate(&config)),
-        fitted::predator(parameters).ok().map(|config| predator_candidate(&config)),
-        fitted::cofinet(parameters).ok().map(|config| cofinet_candidate(&config)),
-        Some(fcgf_candidate(parameters)),
-    ];
-    let filters = [(Network::PointDsc, pointdsc::layout()), (Network::Vbreg, vbreg::layout())];
-    let filters = filters.map(|(network, layout)| filter_candidate(network, layout, parameters));
-    backbones.into_iter().flatten().chain(filters).collect()
+    let rooms = GeoTransformerConfig::three_d_match;
+    let geotransformer = fitted::geotransformer(parameters).unwrap_or_else(|_| rooms());
+    let rooms = PredatorConfig::three_d_match;
+    let predator = fitted::predator(parameters).unwrap_or_else(|_| rooms());
+    let rooms = CoFiNetConfig::three_d_match;
+    let cofinet = fitted::cofinet(parameters).unwrap_or_else(|_| rooms());
+    vec![
+        geotransformer_candidate(&geotransformer),
+        predator_candidate(&predator),
+        cofinet_candidate(&cofinet),
+        fcgf_candidate(parameters),
+        filter_candidate(Network::PointDsc, pointdsc::layout(), parameters),
+        filter_candidate(Network::Vbreg, vbreg::layout(), parameters),
+    ]
 }
 
 fn geotransformer_candidate(config: &GeoTransformerConfig) -> Candidate {
-    let (stages, voxel) = (config.pyramid.stages, config.pyramid.voxel);
-    Candidate {
-        network: Network::GeoTransformer,
-        trained_on: TrainedOn::from_voxel(voxel),
-        configuration: format!(
-            "{stages} stages, the first of points {voxel} m apart; {} features",
-            config.features
-        ),
-        layout: geotransformer::layout(config),
-    }
+    let layout = geotransformer::layout(config);
+    of_pyramid(Network::GeoTransformer, &config.pyramid, config.features, layout)
 }
 
 fn predator_candidate(config: &PredatorConfig) -> Candidate {
-    let (stages, voxel) = (config.pyramid.stages, config.pyramid.voxel);
-    Candidate {
-        network: Network::Predator,
-        trained_on: TrainedOn::from_voxel(voxel),
-        configuration: format!(
-            "{stages} stages, the first of points {voxel} m apart; {} features",
-            config.features
-        ),
-        layout: predator::layout(config),
-    }
+    of_pyramid(Network::Predator, &config.pyramid, config.features, predator::layout(config))
 }
 
 fn cofinet_candidate(config: &CoFiNetConfig) -> Candidate {
-    let (stages, voxel) = (config.pyramid.stages, config.pyramid.voxel);
-    Candidate {
-        network: Network::CoFiNet,
-        trained_on: TrainedOn::from_voxel(voxel),
-        configuration: format!(
-            "{stages} stages, the first of points {voxel} m apart; {} features",
-            config.features
-        ),
-        layout: cofinet::layout(config),
-    }
+    of_pyramid(Network::CoFiNet, &config.pyramid, config.features, cofinet::layout(config))
+}
+
+fn of_pyramid(
+    network: Network,
+    pyramid: &PyramidConfig,
+    features: usize,
+    layout: Layout,
+) -> Candidate {
+    let (stages, voxel) = (pyramid.stages, pyramid.voxel);
+    let configuration =
+        format!("{stages} stages, the first of points {voxel} m apart; {features} features");
+    Candidate { network, trained_on: TrainedOn::from_voxel(voxel), configuration, layout }
 }
 
 fn fcgf_candidate(parameters: &Parameters) -> Candidate {
