@@ -86,7 +86,7 @@ impl CoFiNet {
         let (found, most) = (output.coarse_pairs_found, self.config.most_pairs);
         (found > most).then(|| {
             format!(
-                "CoFiNet is sure of none of {found} pairs of coarse points, so it looks at {most} of them: \
+                "CoFiNet takes {found} pairs of coarse points for possible and looks at the {most} likeliest: \
                  the clouds are unlike those that it was trained on"
             )
         })

@@ -168,17 +168,19 @@ fn a_moved_cloud_is_found() {
 #[test]
 fn clouds_of_few_points_have_few_pairs() {
     let Some(weights) = weights("cofinet_tiny") else { return };
-    let config = CoFiNetConfig { most_pairs: 2, ..tiny() };
+    let config = CoFiNetConfig { most_pairs: 1, ..tiny() };
     let network = CoFiNet::load(&weights, config).unwrap();
     let (limits, selection) = (NeighbourLimits(vec![24; 4]), Selection::default());
     let alone = [Point3::new(0.1, 0.2, 2.0)];
     let wall: Vec<_> =
-        (0..64).map(|i| Point3::new(f64::from(i % 8), f64::from(i / 8), 9.0)).collect();
+        (0..400).map(|i| Point3::new(f64::from(i % 20), f64::from(i / 20), 9.0)).collect();
     let wall: Vec<_> = wall.iter().map(|point| point * 0.1).collect();
     let description = network.describe(&wall, &alone, &limits, &selection).unwrap();
     assert!(description.target_from_source.is_err());
     let description = network.describe(&wall, &wall, &limits, &selection).unwrap();
     assert!(!description.correspondences.is_empty());
+    let warnings = &description.warnings;
+    assert!(warnings.iter().any(|warning| warning.contains("likeliest")), "{warnings:?}");
     let expected = network.expected_bytes(&wall, &wall, &limits).unwrap();
     assert!((10_000..100_000_000).contains(&expected), "{expected}");
     assert!(network.describe(&[], &wall, &limits, &selection).is_err());
