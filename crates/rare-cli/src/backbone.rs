@@ -109,8 +109,7 @@ pub(crate) fn open_filter(
 ) -> Result<Box<dyn PoseEstimator>> {
     let parameters = networks::open(file)?;
     let noise = settings.vbreg_noise.then_some(settings.refiner.seed);
-    networks::open_filter(network, &parameters, noise)
-        .with_context(|| format!("--weights {}", file.display()))
+    networks::open_filter(network, &parameters, noise).context("--weights")
 }
 
 impl OpenBackbone {
@@ -124,8 +123,7 @@ impl OpenBackbone {
         settings: &Settings,
     ) -> Result<OpenBackbone> {
         let parameters = networks::open(file)?;
-        let backbone = Backbone::load(wanted.network, &parameters)
-            .with_context(|| format!("--weights {}", file.display()))?;
+        let backbone = Backbone::load(wanted.network, &parameters).context("--weights")?;
         let trained_on = backbone.trained_on();
         let count = match trained_on {
             TrainedOn::ThreeDMatch => KEYPOINTS_IN_ROOMS,

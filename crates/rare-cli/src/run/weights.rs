@@ -84,7 +84,7 @@ fn describe(source: &Source) -> String {
 /// them.
 fn check(args: CheckArgs) -> Result<u8> {
     let folder = match args.path {
-        Some(file) if file.is_file() => return checkpoint::check(&file),
+        Some(file) if !file.is_dir() => return checkpoint::check(&file),
         Some(folder) => folder,
         None => default_folder(Choice::default())?,
     };

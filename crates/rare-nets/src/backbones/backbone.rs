@@ -135,12 +135,19 @@ impl Backbone {
         limits: Option<&NeighbourLimits>,
         request: &Request,
     ) -> Result<()> {
-        let (Some(memory), Some(limits)) = (request.memory, limits) else { return Ok(()) };
-        let needed = match &self.loaded {
-            Loaded::GeoTransformer(network, _) => network.expected_bytes(from, to, limits)?,
-            Loaded::Predator(network, _) => network.expected_bytes(from, to, limits)?,
-            Loaded::CoFiNet(network, _) => network.expected_bytes(from, to, limits)?,
-            Loaded::Fcgf(_) => return Ok(()),
+        let Some(memory) = request.memory else { return Ok(()) };
+        let needed = match (&self.loaded, limits) {
+            (Loaded::GeoTransformer(network, _), Some(limits)) => {
+                network.expected_bytes(from, to, limits)?
+            }
+            (Loaded::Predator(network, _), Some(limits)) => {
+                network.expected_bytes(from, to, limits)?
+            }
+            (Loaded::CoFiNet(network, _), Some(limits)) => {
+                network.expected_bytes(from, to, limits)?
+            }
+            (Loaded::Fcgf(network), _) => network.expected_bytes(from, to)?,
+            (_, None) => 0,
         };
         if needed <= memory {
             return Ok(());

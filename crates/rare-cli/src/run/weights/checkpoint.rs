@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use anyhow::{Context, Result, bail};
+use anyhow::{Result, bail};
 use rare_nets::checkpoint::{Differences, Misshapen, Parameters};
 use rare_nets::networks::{self, Identity};
 
@@ -28,7 +28,7 @@ pub(super) fn check(file: &Path) -> Result<u8> {
     if !identity.differences.is_empty() {
         return Ok(BAD_INPUT);
     }
-    networks::check(&identity, &parameters).with_context(|| file.display().to_string())?;
+    networks::check(&identity, &parameters)?;
     Ok(SUCCESS)
 }
 

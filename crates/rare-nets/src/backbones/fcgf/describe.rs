@@ -4,9 +4,13 @@ use rare::matching::{self, Match};
 use rare::nalgebra::Point3;
 use rare::{PointFeatures, Result};
 
+use super::voxels::voxelise;
 use super::{Fcgf, FcgfConfig, Matching};
 use crate::backbones::consensus::{correspondences, for_target, pose};
 use crate::backbones::{Description, Keypoints, Selection, SelectionRule, sampling};
+
+/// Bytes of features and kernel maps for each voxel of the finest stride (measured in a room: 2600).
+const BYTES_PER_VOXEL: u64 = 3000;
 
 impl Fcgf {
     /// Describes two clouds: `selection.count` random keypoints on each side, because the network does not say which
@@ -41,6 +45,16 @@ impl Fcgf {
             neighbour_limits: None,
             warnings: of_source.into_iter().chain(of_target).collect(),
         })
+    }
+
+    /// An estimate of the bytes that [`Fcgf::describe`] takes for these clouds, from the number of their voxels.
+    ///
+    /// # Errors
+    /// Those of [`Fcgf::describe`].
+    pub fn expected_bytes(&self, source: &[Point3<f64>], target: &[Point3<f64>]) -> Result<u64> {
+        let voxels = |points| Ok(voxelise(points, self.config.voxel)?.kept.len() as u64);
+        let voxels: Result<u64> = voxels(source).and_then(|count| Ok(count + voxels(target)?));
+        Ok(voxels? * BYTES_PER_VOXEL)
     }
 
     /// Random voxels of a cloud, and what to say if its points are far apart.
