@@ -57,32 +57,35 @@ pub(crate) struct Described {
 }
 
 impl OpenNetworks {
-    /// Opens what the settings ask for.
+    /// Opens what the settings ask for, to describe clouds and to estimate an initial transform.
     ///
     /// # Errors
-    /// If weights are missing, of another network, or damaged.
+    /// If weights are missing, of another network, damaged, or of no use.
     pub(crate) fn of(settings: &Settings, weights: &GivenWeights) -> Result<OpenNetworks> {
-        let filter = match settings.init_method {
-            Some(InitMethod::Filter(filter)) => Some(filter.network()),
-            Some(InitMethod::Builtin(_)) | None => None,
+        let describing = OpenNetworks::describing(settings, weights)?;
+        let open_filter = |network: Network| {
+            let option = format!("--init-method {}", network.name());
+            open_filter(weights.of(network, &option)?, network, settings)
         };
+        Ok(OpenNetworks { filter: filter(settings).map(open_filter).transpose()?, ..describing })
+    }
+
+    /// Opens what the settings ask for where the initial transform is known. Weights of its estimator are no mistake: one
+    /// configuration file serves all commands.
+    ///
+    /// # Errors
+    /// Those of [`OpenNetworks::of`].
+    pub(crate) fn describing(settings: &Settings, weights: &GivenWeights) -> Result<OpenNetworks> {
         let backbone = settings.backbone.as_ref();
-        let used: Vec<Network> =
-            backbone.map(|backbone| backbone.network).into_iter().chain(filter).collect();
+        let networks = backbone.map(|backbone| backbone.network).into_iter();
+        let used: Vec<Network> = networks.chain(filter(settings)).collect();
         weights.check_use(settings, &used)?;
         let open = |backbone: &options::Backbone| {
             let option = format!("--backbone {}", backbone.network.name());
             let file = weights.of(backbone.network, &option)?;
             OpenBackbone::open(file, backbone, settings)
         };
-        let open_filter = |network: Network| {
-            let option = format!("--init-method {}", network.name());
-            open_filter(weights.of(network, &option)?, network, settings)
-        };
-        Ok(OpenNetworks {
-            backbone: backbone.map(open).transpose()?,
-            filter: filter.map(open_filter).transpose()?,
-        })
+        Ok(OpenNetworks { backbone: backbone.map(open).transpose()?, filter: None })
     }
 
     /// Describes both clouds, if a network is to do that, and gives both scans the features.
@@ -98,6 +101,14 @@ impl OpenNetworks {
         let Some(backbone) = &self.backbone else { return Ok(None) };
         progress.step("describe");
         backbone.describe(source, reference).map(Some)
+    }
+}
+
+/// The network of a learned `--init-method`.
+fn filter(settings: &Settings) -> Option<Network> {
+    match settings.init_method {
+        Some(InitMethod::Filter(filter)) => Some(filter.network()),
+        Some(InitMethod::Builtin(_)) | None => None,
     }
 }
 
@@ -135,16 +146,23 @@ impl OpenBackbone {
             trained_on,
             weights: file.to_owned(),
             weights_fingerprint: WeightsIdentity::of(&[file.to_owned()])?.fingerprint,
-            neighbor_limits: None,
+            neighbor_limits: wanted.neighbour_limits.clone(),
             selection,
         };
         let neighbour_limits = wanted.neighbour_limits.clone();
         Ok(OpenBackbone { backbone, selection, neighbour_limits, record })
     }
 
-    /// What is known of it before any cloud is.
-    pub(crate) fn record(&self) -> &BackboneRecord {
-        &self.record
+    /// What results depend on: everything but the place of the file.
+    ///
+    /// # Errors
+    /// If it cannot be written as JSON.
+    pub(crate) fn identity(&self) -> Result<serde_json::Value> {
+        let mut identity = serde_json::to_value(&self.record)?;
+        if let Some(record) = identity.as_object_mut() {
+            record.remove("weights");
+        }
+        Ok(identity)
     }
 
     /// Describes both clouds, and gives both scans the features.

@@ -4,7 +4,9 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
+use rare_nets::cache::WeightsIdentity;
 use rare_nets::networks::{self, Identity, Network, TrainedOn};
+use serde::Serialize;
 
 use crate::options::{Encoder, Settings};
 
@@ -17,8 +19,33 @@ struct Given {
     identity: Option<Identity>,
 }
 
+/// Which weights a network has that tells right correspondences from wrong ones.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct FilterIdentity {
+    network: Network,
+    /// SHA-256 of the name, length and samples of the file.
+    weights_fingerprint: String,
+}
+
 impl GivenWeights {
-    /// Looks into every path; no weight is read.
+    /// Those of networks that tell right correspondences from wrong ones.
+    ///
+    /// # Errors
+    /// If a file cannot be read.
+    pub(crate) fn filters(&self) -> Result<Vec<FilterIdentity>> {
+        let networks = self.0.iter().filter_map(|given| {
+            let network = given.identity.as_ref()?.network;
+            network.is_filter().then_some((network, &given.path))
+        });
+        networks
+            .map(|(network, path)| {
+                let weights_fingerprint = WeightsIdentity::of(&[path.clone()])?.fingerprint;
+                Ok(FilterIdentity { network, weights_fingerprint })
+            })
+            .collect()
+    }
+
+    /// Looks into every path: at names and shapes, and at the few numbers that say what a network was trained on.
     ///
     /// # Errors
     /// If a path does not exist, or is a file that is no checkpoint.

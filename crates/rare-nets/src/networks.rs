@@ -143,7 +143,8 @@ pub fn open(path: &Path) -> Result<Parameters> {
     parameters.renamed(|name| name.strip_prefix(PREFIX).map(str::to_owned))
 }
 
-/// Which network the weights are of, by names and shapes alone; `None` if of none that is known.
+/// Which network the weights are of, by names, shapes and the few numbers that say what it was trained on; `None` if of
+/// none that is known.
 #[must_use]
 pub fn identify(parameters: &Parameters) -> Option<Identity> {
     let share = |candidate: &Candidate| {

@@ -96,6 +96,9 @@ impl Options {
             }
             return Ok(None);
         };
+        if network == Network::Fcgf && self.neighbor_limits.is_some() {
+            bail!("--neighbor-limits is of no use to FCGF, which has no neighbourhoods");
+        }
         Ok(Some(Backbone {
             network,
             neighbour_limits: self.neighbor_limits.clone(),

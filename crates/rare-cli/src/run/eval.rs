@@ -21,7 +21,7 @@ use start::Starts;
 
 use crate::args::{DatasetKind, EvalArgs, Format};
 use crate::backbone::OpenBackbone;
-use crate::given_weights::GivenWeights;
+use crate::given_weights::{FilterIdentity, GivenWeights};
 use crate::options::{Encoder, Settings};
 use crate::report::{self, Index};
 use crate::{SUCCESS, run, summary};
@@ -34,6 +34,8 @@ struct Plan {
     settings: Settings,
     /// The network that describes the clouds.
     backbone: Option<OpenBackbone>,
+    /// The weights that were given for networks which tell right correspondences from wrong ones.
+    filters: Vec<FilterIdentity>,
     /// The pairs of this shard.
     pairs: Vec<usize>,
     jobs: usize,
@@ -97,20 +99,28 @@ impl Plan {
         let (index, count) = args.shard.unwrap_or((0, 1));
         let pairs = (0..dataset.pairs.len()).skip(index).step_by(count).collect();
         let jobs = usize::from(args.jobs);
-        Ok(Plan { dataset, starts, methods, settings, backbone, pairs, jobs })
+        let filters = weights.filters()?;
+        Ok(Plan { dataset, starts, methods, settings, backbone, filters, pairs, jobs })
     }
 
     /// What the results depend on.
     fn benchmark(&self) -> Result<Benchmark> {
+        let mut settings = json!({
+            "start": self.starts.description(),
+            "refiner": serde_json::to_value(&self.settings.refiner)?,
+            "version": env!("CARGO_PKG_VERSION"),
+        });
+        if let Some(backbone) = &self.backbone {
+            settings["backbone"] = backbone.identity()?;
+        }
+        if !self.filters.is_empty() {
+            settings["filters"] = serde_json::to_value(&self.filters)?;
+            settings["vbreg_noise"] = self.settings.vbreg_noise.into();
+        }
         Ok(Benchmark {
             name: self.dataset.name.clone(),
             protocol: self.dataset.protocol,
-            settings: json!({
-                "start": self.starts.description(),
-                "backbone": self.backbone.as_ref().map(OpenBackbone::record),
-                "refiner": serde_json::to_value(&self.settings.refiner)?,
-                "version": env!("CARGO_PKG_VERSION"),
-            }),
+            settings,
             pairs: self.dataset.pairs.iter().map(|pair| (&pair.truth).into()).collect(),
         })
     }

@@ -23,13 +23,14 @@ pub(super) fn run(args: FeaturesArgs) -> Result<u8> {
     check_outputs(&settings, &inputs)?;
     start_threads(&settings)?;
     let weights = GivenWeights::read(&settings.weights)?;
+    let networks = OpenNetworks::describing(&settings, &weights)?;
     let written = match (args.reference, args.init) {
         (reference, None) if settings.backbone.is_some() => {
             let Some(reference) = reference else {
                 bail!("a network looks at both clouds together: name the reference as well")
             };
             let clouds = Clouds { source: args.source, reference };
-            by_network(&clouds, &settings, &weights, output)?
+            by_network(&clouds, &settings, &networks, output)?
         }
         (_, Some(_)) if settings.backbone.is_some() => {
             bail!(
@@ -93,12 +94,11 @@ fn of_pair(
 fn by_network(
     clouds: &Clouds,
     settings: &Settings,
-    weights: &GivenWeights,
+    networks: &OpenNetworks,
     output: &Path,
 ) -> Result<String> {
     let progress = Progress::start(settings.quiet);
     progress.step("read");
-    let networks = OpenNetworks::of(settings, weights)?;
     let (mut source, mut reference) = (read_scan(&clouds.source)?, read_scan(&clouds.reference)?);
     let described = networks.describe(&mut source, &mut reference, &progress);
     let Some(Described { description, .. }) = described.with_context(|| which(clouds))? else {

@@ -112,7 +112,7 @@ fn read(clouds: &Clouds, start: &Start, settings: &mut Settings) -> Result<Probl
     let initial = read_initial(&start.init, start.init_direction)?;
     let recorded = read_recorded(settings, &initial)?;
     let weights = GivenWeights::read(&settings.weights)?;
-    let networks = OpenNetworks::of(settings, &weights)?;
+    let networks = OpenNetworks::describing(settings, &weights)?;
     let pipeline = OpenPipeline::of(settings, &weights)?;
     let features = |file: &Option<PathBuf>, side| -> rare::Result<_> {
         file.as_ref().map(|file| files::read_features_of_side(file, side)).transpose()

@@ -175,6 +175,10 @@ fn weights_that_do_not_fit_are_named() {
     );
     refused(&["--backbone", "predator"], &["Predator", "--weights", "rare weights list"]);
     refused(&["--weights", &weights], &["Predator", "--backbone predator"]);
+    let features = ["features", "source.xyz", "--output", "f.npz", "--weights", &weights];
+    workplace.run(&features).assert_refused(&["Predator", "--backbone predator"]);
+    let fcgf = ["--backbone", "fcgf", "--neighbor-limits", "3,3"];
+    refused(&fcgf, &["--neighbor-limits", "FCGF"]);
     refused(&[&predator[..], &["nowhere.pth"]].concat(), &["--weights nowhere.pth"]);
     refused(&["--neighbor-limits", "3,3,3,3"], &["--neighbor-limits", "--backbone"]);
     // Cut off, damaged, with code in it.
@@ -217,6 +221,20 @@ fn clouds_that_do_not_fit_are_named() {
     workplace.write("sparse.xyz", sparse);
     let outcome = run("sparse.xyz", &[]);
     assert!(outcome.stderr.contains("0.1 m apart") || outcome.code == 2, "{outcome:?}");
+}
+
+#[test]
+fn one_configuration_serves_commands_that_estimate_nothing() {
+    let workplace = Workplace::with_pair();
+    let Some(pointdsc) = filter("pointdsc") else { return };
+    let file = format!("init-method = \"pointdsc\"\nweights = {:?}\n", argument(&pointdsc));
+    workplace.write("rare.toml", file);
+    let outcome = workplace.refine(&["--config", "rare.toml"]);
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    let pair = ["register", "source.xyz", "reference.xyz", "--config", "rare.toml"];
+    let outcome = workplace.run(&[&pair[..], &["--json", "out.json"]].concat());
+    assert!(outcome.code < 2, "{outcome:?}");
+    assert_eq!(workplace.json("out.json")["config"]["init_method"], "pointdsc");
 }
 
 #[test]

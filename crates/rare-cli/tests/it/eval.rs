@@ -483,3 +483,29 @@ fn weights_fill_rows_of_the_papers_tables() {
     assert!(text.contains("no --weights of FCGF for 3DMatch"), "{text}");
     assert!(workplace.path("out/3DMatch-predator/results.jsonl").is_file());
 }
+
+#[test]
+fn estimators_need_no_pose_of_the_network() {
+    let workplace = benchmark();
+    let Some(network) = network_weights(&workplace, "geotransformer_tiny") else { return };
+    let evaluation = ["eval", "folder", "room", "--out", "out", "--limit", "2", "-q"];
+    let backbone = ["--backbone", "geotransformer", "--weights", &network];
+    let methods = ["--methods", "init,ransac-50k"];
+    let outcome = workplace.run(&[&evaluation[..], &backbone, &methods].concat());
+    assert_eq!(outcome.code, 0, "{outcome:?}");
+    let lines = lines(&workplace, "out");
+    let of = |pair: usize, method: &str| {
+        let is_it = |line: &&Value| line["pair"] == pair && line["method"] == method;
+        lines.iter().find(is_it).unwrap().clone()
+    };
+    // Nobody trained the network: its own registration finds nothing, which is no matter of RANSAC's.
+    for pair in 0..2 {
+        let (own, ransac) = (of(pair, "init"), of(pair, "ransac-50k"));
+        assert!(own["target_from_source"].is_null() && own["error"].is_string(), "{own}");
+        assert_ne!(own["error"], ransac["error"], "{ransac}");
+    }
+    // Other limits give other results: they need another folder.
+    let limits = ["--neighbor-limits", "9,9,9,9"];
+    let other = workplace.run(&[&evaluation[..], &backbone, &methods, &limits].concat());
+    other.assert_refused(&["out"]);
+}

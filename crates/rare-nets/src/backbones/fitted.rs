@@ -1,5 +1,6 @@
 //! The sizes and lengths of a network from its weights: sizes by the shapes of tensors, lengths by the kernel points,
-//! which are stored in metres. So any network of the same topology runs, whatever its widths and its spacing.
+//! which are stored in metres. So any network of the same topology runs, whatever its widths and its spacing; numbers of
+//! groups and heads, which weights do not say, are those of the released networks.
 
 use rare::pose::Ransac;
 use rare::{Error, Result};
@@ -37,7 +38,7 @@ pub(crate) fn geotransformer(parameters: &Parameters) -> Result<GeoTransformerCo
     Ok(GeoTransformerConfig {
         pyramid,
         width,
-        groups: (width / 2).max(1),
+        groups: groups(width, released.groups),
         features: size(parameters, "backbone.decoder2.mlp.weight", 0)?,
         transformer: TransformerConfig {
             hidden: size(parameters, "transformer.in_proj.weight", 0)?,
@@ -51,6 +52,13 @@ pub(crate) fn geotransformer(parameters: &Parameters) -> Result<GeoTransformerCo
         },
         ..released
     })
+}
+
+/// How many groups channels are normalised in, which weights do not say: as many as in the released networks where they
+/// divide the narrowest layer, half the first width, or else one for each of its channels.
+fn groups(width: usize, released: usize) -> usize {
+    let narrowest = (width / 2).max(1);
+    if narrowest.is_multiple_of(released) { released } else { narrowest }
 }
 
 /// The Predator that the weights are of.

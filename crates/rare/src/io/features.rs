@@ -175,12 +175,12 @@ fn recording_entries(recording: &Recording) -> [Entry; 4] {
 pub struct RegistrationDump {
     /// Each side in its cloud's frame, metres, with scores.
     pub correspondences: Vec<Correspondence>,
-    /// Moves the source into the frame of the reference, as the file holds it.
-    pub target_from_source: Matrix4<f64>,
+    /// Moves the source into the frame of the reference, as the file holds it; `None` if the run found none.
+    pub target_from_source: Option<Matrix4<f64>>,
 }
 
 /// Reads the dump of a pair by GeoTransformer's `test.py`: an NPZ archive with `ref_corr_points`, `src_corr_points`,
-/// `corr_scores` and `estimated_transform` (source to reference).
+/// `corr_scores` and, if a transform was found, `estimated_transform` (source to reference).
 ///
 /// # Errors
 /// As [`read_correspondences`].
@@ -194,18 +194,25 @@ pub fn read_registration_dump(path: impl AsRef<Path>) -> Result<RegistrationDump
         return Err(count_error(path, "src_corr_points", sources, "ref_corr_points", targets));
     }
     let scores = scores(path, &file.array_f64("corr_scores")?, source.len())?;
-    let transform = file.array_f64("estimated_transform")?;
-    if transform.shape != [4, 4] {
-        return Err(shape_error(path, "estimated_transform", "4 x 4", &transform.shape));
-    }
-    check_finite(path, "estimated_transform", &transform.values, 4)?;
+    let has_transform = file.names().iter().any(|name| name == "estimated_transform");
+    let target_from_source =
+        has_transform.then(|| estimated_transform(path, &mut file)).transpose()?;
     let pairs = source.into_iter().zip(target).zip(scores);
     Ok(RegistrationDump {
         correspondences: pairs
             .map(|((source, target), score)| Correspondence { source, target, score })
             .collect(),
-        target_from_source: Matrix4::from_row_slice(&transform.values),
+        target_from_source,
     })
+}
+
+fn estimated_transform(path: &Path, file: &mut NpzFile) -> Result<Matrix4<f64>> {
+    let transform = file.array_f64("estimated_transform")?;
+    if transform.shape != [4, 4] {
+        return Err(shape_error(path, "estimated_transform", "4 x 4", &transform.shape));
+    }
+    check_finite(path, "estimated_transform", &transform.values, 4)?;
+    Ok(Matrix4::from_row_slice(&transform.values))
 }
 
 /// Reads correspondences: an NPZ archive of `source` and `reference` (`N x 3`, metres, each in its cloud's frame) and,

@@ -97,14 +97,13 @@ impl Method {
         reference: &Scan,
         start: &Start,
     ) -> rare::Result<Found> {
-        let initial = &start.pose;
         match &self.kind {
             Kind::Init => {
-                let target_from_source = *initial;
+                let target_from_source = start.pose()?;
                 Ok(Found { target_from_source, confidence: None, signals: None, verdict: None })
             }
             Kind::Icp(method, voxel) => {
-                let initial = RigidTransform::from_matrix(initial)?;
+                let initial = RigidTransform::from_matrix(&start.pose()?)?;
                 align(*method, *voxel, source, reference, &initial)
             }
             Kind::Estimate(estimator, config) => {
@@ -138,7 +137,7 @@ pub(super) fn refine(
     reference: &Scan,
     start: &Start,
 ) -> rare::Result<Refinement> {
-    let initial = RigidTransform::from_matrix(&start.pose)?;
+    let initial = RigidTransform::from_matrix(&start.pose()?)?;
     match &start.correspondences {
         Some(pairs) => refiner.refine_matched(source, reference, &initial, pairs),
         None => refiner.refine(source, reference, &initial),

@@ -80,7 +80,7 @@ impl Page<'_> {
         let mut scans = Loaded { source, reference };
         let start = scans.start(self.index, plan);
         let refined = start.and_then(|start| {
-            let initial = RigidTransform::from_matrix(&start.pose)?;
+            let initial = RigidTransform::from_matrix(&start.pose()?)?;
             let refinement = refine(&refiner, &scans.source, &scans.reference, &start)?;
             let total_seconds = clock.elapsed().as_secs_f64();
             let pair = [&scans.source, &scans.reference];

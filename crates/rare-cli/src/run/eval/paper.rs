@@ -257,6 +257,7 @@ impl Row {
             methods,
             settings: sources.settings.clone(),
             backbone,
+            filters: sources.weights.filters()?,
             pairs,
             jobs: usize::from(sources.args.jobs),
         };

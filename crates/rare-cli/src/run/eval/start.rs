@@ -30,8 +30,8 @@ pub(super) enum Starts {
 
 /// Where the methods start on one pair.
 pub(super) struct Start {
-    /// Moves the source into the frame of the reference.
-    pub(super) pose: Matrix4<f64>,
+    /// Moves the source into the frame of the reference; why there is none, if what made the correspondences found none.
+    pub(super) pose: Result<Matrix4<f64>, String>,
     /// Correspondences that came with it, best first.
     pub(super) correspondences: Option<Vec<Correspondence>>,
     /// What a network said of the pair, which has its features then.
@@ -94,27 +94,37 @@ impl Starts {
 impl Start {
     /// A transform alone.
     pub(super) fn at(pose: Matrix4<f64>) -> Start {
-        Start { pose, correspondences: None, description: None }
+        Start { pose: Ok(pose), correspondences: None, description: None }
     }
 
-    fn matched(pose: Matrix4<f64>, correspondences: Vec<Correspondence>) -> Start {
-        Start { correspondences: Some(correspondences), ..Start::at(pose) }
+    /// The transform.
+    ///
+    /// # Errors
+    /// `NoPose` if there is none.
+    pub(super) fn pose(&self) -> rare::Result<Matrix4<f64>> {
+        self.pose.clone().map_err(rare::Error::no_pose)
     }
 
     /// Reads a dump and keeps so many of its correspondences, those with the highest scores. Where it has no transform
-    /// (CoFiNet, Predator), RANSAC makes one of them, as those networks' own scripts do.
+    /// (always of CoFiNet and Predator), RANSAC makes one of them, as those networks' own scripts do.
     pub(super) fn read(file: &Path, most: usize, ransac: &Ransac) -> rare::Result<Start> {
-        if official::is_fragment(file) {
-            let mut correspondences = official::read_network_dump(file)?;
-            correspondences.truncate(most);
-            let point = PointCloud::new(vec![Point3::origin()])?;
-            let pose = ransac.estimate(&point, &point, &correspondences)?.target_from_source;
-            return Ok(Start::matched(pose.to_matrix(), correspondences));
-        }
-        let mut dump = rare::io::read_registration_dump(file)?;
-        dump.correspondences.sort_by(|a, b| b.score.total_cmp(&a.score));
-        dump.correspondences.truncate(most);
-        Ok(Start::matched(dump.target_from_source, dump.correspondences))
+        let (mut correspondences, pose) = if official::is_fragment(file) {
+            (official::read_network_dump(file)?, None)
+        } else {
+            let dump = rare::io::read_registration_dump(file)?;
+            (dump.correspondences, dump.target_from_source)
+        };
+        correspondences.sort_by(|a, b| b.score.total_cmp(&a.score));
+        correspondences.truncate(most);
+        let pose = match pose {
+            Some(pose) => Ok(pose),
+            None => {
+                let point = PointCloud::new(vec![Point3::origin()])?;
+                let found = ransac.estimate(&point, &point, &correspondences);
+                found.map(|found| found.target_from_source.to_matrix()).map_err(|e| e.to_string())
+            }
+        };
+        Ok(Start { pose, correspondences: Some(correspondences), description: None })
     }
 }
 

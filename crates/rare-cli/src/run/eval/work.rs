@@ -146,10 +146,10 @@ impl Loaded {
             return Ok(Start { description: Some(description), ..start });
         }
         let pose = match &description.target_from_source {
-            Ok(pose) => pose.to_matrix(),
-            Err(error) => return Err(rare::Error::no_pose(error.to_string())),
+            Ok(pose) => Ok(pose.to_matrix()),
+            Err(error) => Err(error.to_string()),
         };
-        Ok(Start { description: Some(description), ..Start::at(pose) })
+        Ok(Start { pose, correspondences: None, description: Some(description) })
     }
 
     fn start_of(&self, index: usize, plan: &Plan) -> rare::Result<Start> {

@@ -27,10 +27,9 @@ pub(super) struct Kept {
 ///
 /// At a threshold below 0 all pairs count, however few there are: two small clouds have no more.
 pub(super) fn coarse_pairs(confidences: &Matrix, config: &CoFiNetConfig) -> Kept {
-    let enough = |threshold: f64| {
-        let above = |value: &&f32| f64::from(**value) > threshold;
-        confidences.values().iter().filter(above).count() >= config.fewest_pairs
-    };
+    // There are enough above a threshold if the last of the wanted number is.
+    let last = last_of_best(confidences.values(), config.fewest_pairs);
+    let enough = |threshold: f64| last.is_some_and(|last| f64::from(last) > threshold);
     // A step that leads nowhere must not be repeated for ever.
     let step = if config.threshold_step > 0.0 { config.threshold_step } else { f64::INFINITY };
     let mut threshold = config.first_threshold;
@@ -53,6 +52,17 @@ pub(super) fn coarse_pairs(confidences: &Matrix, config: &CoFiNetConfig) -> Kept
         pairs.sort_by_key(|pair| (pair.source, pair.target));
     }
     Kept { pairs, found }
+}
+
+/// The lowest of so many highest values; `None` if there are not as many.
+fn last_of_best(values: &[f32], count: usize) -> Option<f32> {
+    // What is no number is above no threshold.
+    let mut numbers: Vec<f32> = values.iter().copied().filter(|value| !value.is_nan()).collect();
+    let place = count.max(1) - 1;
+    if place >= numbers.len() {
+        return None;
+    }
+    Some(*numbers.select_nth_unstable_by(place, |a, b| b.total_cmp(a)).1)
 }
 
 #[cfg(test)]

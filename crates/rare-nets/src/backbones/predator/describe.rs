@@ -66,10 +66,15 @@ impl Predator {
     ) -> Result<u64> {
         let prepared = Prepared::new(source, target, &self.config.pyramid)?;
         // Edges of a graph, and their products before and after they are normalised.
-        let edges =
-            prepared.coarsest().iter().sum::<usize>() as u64 * self.config.neighbours as u64;
-        Ok(prepared.bytes(&self.config.encoder(), limits)
-            + edges * 4 * self.config.coarse_channels as u64 * WORD)
+        let [source, target] = prepared.coarsest().map(|count| count as u64);
+        let edges = (source + target) * self.config.neighbours as u64;
+        // How alike any two coarse points are: as the engine has it, as a matrix, and the other way round.
+        let alike = source.saturating_mul(target).saturating_mul(3 * WORD);
+        let edges = edges * 4 * self.config.coarse_channels as u64 * WORD;
+        Ok(prepared
+            .bytes(&self.config.encoder(), limits)
+            .saturating_add(edges)
+            .saturating_add(alike))
     }
 
     /// A remark if a cloud has fewer coarse points than the graph wants.
