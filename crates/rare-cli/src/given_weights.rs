@@ -39,7 +39,8 @@ impl GivenWeights {
         });
         networks
             .map(|(network, path)| {
-                let weights_fingerprint = WeightsIdentity::of(&[path.clone()])?.fingerprint;
+                let weights_fingerprint =
+                    WeightsIdentity::of(std::slice::from_ref(path))?.fingerprint;
                 Ok(FilterIdentity { network, weights_fingerprint })
             })
             .collect()
