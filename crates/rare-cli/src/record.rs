@@ -11,6 +11,7 @@ use rare::{Recipe, RigidTransform};
 use serde::{Serialize, Serializer};
 
 use crate::backbone::BackboneRecord;
+use crate::given_weights::FilterIdentity;
 use crate::network::NetworkRecord;
 use crate::options::{Encoder, Preset, Settings};
 use crate::run::{Inputs, Registration};
@@ -63,6 +64,8 @@ struct Config<'a> {
     diffusion: Option<&'a NetworkRecord>,
     #[serde(skip_serializing_if = "Option::is_none")]
     backbone: Option<&'a BackboneRecord>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    filter: Option<&'a FilterIdentity>,
     threads: usize,
     recipe: &'a Recipe,
     scale: Scale,
@@ -193,6 +196,7 @@ fn config(registration: &Registration) -> Config<'_> {
         depth_features: settings.depth_features.as_ref().map(|file| file.display().to_string()),
         diffusion: registration.network.as_ref(),
         backbone: registration.backbone.as_ref(),
+        filter: registration.filter.as_ref(),
         threads: rayon::current_num_threads(),
         recipe: &settings.refiner.recipe,
         scale,

@@ -24,6 +24,7 @@ use serde::Serialize;
 
 use crate::args::{Cli, Clouds, Command, Direction};
 use crate::backbone::BackboneRecord;
+use crate::given_weights::FilterIdentity;
 use crate::network::NetworkRecord;
 use crate::options::{InitMethod, Settings};
 use crate::outputs::{self, Output};
@@ -62,6 +63,8 @@ pub(crate) struct Registration {
     pub(crate) network: Option<NetworkRecord>,
     /// The network that described the clouds.
     pub(crate) backbone: Option<BackboneRecord>,
+    /// The network that chose among correspondences for the initial transform.
+    pub(crate) filter: Option<FilterIdentity>,
     pub(crate) read_seconds: f64,
     pub(crate) total_seconds: f64,
 }

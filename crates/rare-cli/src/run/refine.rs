@@ -102,6 +102,7 @@ pub(super) fn registration(
         illustration,
         network,
         backbone: described.map(|described| described.record),
+        filter: None,
         read_seconds,
         total_seconds,
     })

@@ -38,6 +38,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
     let weights = GivenWeights::read(&settings.weights)?;
     let networks = OpenNetworks::of(&settings, &weights)?;
     let pipeline = OpenPipeline::of(&settings, &weights)?;
+    let filter = weights.filters()?.into_iter().next().filter(|_| networks.filter.is_some());
     let (mut source, mut reference) = (read_scan(&clouds.source)?, read_scan(&clouds.reference)?);
     let read_seconds = clock.elapsed().as_secs_f64();
     let described =
@@ -67,6 +68,7 @@ fn registration(clouds: &Clouds, settings: Settings) -> Result<Registration> {
         illustration,
         network,
         backbone: described.map(|described| described.record),
+        filter,
         read_seconds,
         total_seconds,
     })

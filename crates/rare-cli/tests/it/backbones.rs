@@ -128,7 +128,11 @@ fn filters_make_initial_transforms_of_built_in_matches() {
         let method = ["--init-method", name, "--weights", argument(&file)];
         let outcome = workplace.run(&[&pair[..], &method].concat());
         assert!(outcome.code < 2, "{outcome:?}");
-        assert_eq!(workplace.json("out.json")["config"]["init_method"], name);
+        let config = workplace.json("out.json")["config"].clone();
+        assert_eq!(
+            (&config["init_method"], &config["filter"]["network"]),
+            (&name.into(), &name.into())
+        );
         let missing = workplace.run(&[&pair[..], &["--init-method", name]].concat());
         missing.assert_refused(&[name, "--weights", "rare weights list"]);
     }

@@ -104,6 +104,7 @@ impl Page<'_> {
             illustration: None,
             network: None,
             backbone: None,
+            filter: None,
             read_seconds,
             total_seconds,
         };
