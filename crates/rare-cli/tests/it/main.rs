@@ -8,6 +8,7 @@ mod benchmark;
 mod commands;
 mod diffusion;
 mod eval;
+mod eval_networks;
 mod features;
 mod icp;
 mod options;

@@ -48,13 +48,6 @@ impl FcgfConfig {
         }
     }
 
-    /// Rooms at 5 cm.
-    #[must_use]
-    pub fn three_d_match_coarse() -> FcgfConfig {
-        let voxel = 0.05;
-        FcgfConfig { voxel, ransac: ransac(1.5 * voxel), ..FcgfConfig::three_d_match() }
-    }
-
     /// Streets at 30 cm.
     #[must_use]
     pub fn kitti() -> FcgfConfig {

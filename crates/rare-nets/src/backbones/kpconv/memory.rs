@@ -2,23 +2,12 @@
 
 use super::NeighbourLimits;
 
-/// A stage of a surface that was sampled at its voxel has this many times the points of the next: four on a plane, less
-/// where it is rough or torn (measured: 3.6 to 3.8 in rooms).
-const THINNING: usize = 3;
-
 /// Bytes of a number, an index.
 const WORD: u64 = 4;
 
 /// Rows of features of a stage that live at once: what comes in, the shortcut, what lies between, what goes out, and a
 /// copy in the matrix product.
 const LIVE: u64 = 5;
-
-/// How many points each of so many stages is expected to have if the finest has `points`.
-#[must_use]
-pub fn expected_counts(points: usize, stages: usize) -> Vec<usize> {
-    let next = |count: &usize| Some(count.div_ceil(THINNING));
-    std::iter::successors(Some(points), next).take(stages).collect()
-}
 
 /// An estimate of the bytes that a pyramid with so many points in each stage (both clouds together) takes with the
 /// features of a network, of which `channels` are the widest of each stage.
@@ -48,9 +37,13 @@ mod tests {
     #[test]
     fn estimates_grow_with_points_and_never_wrap() {
         let limits = NeighbourLimits::three_d_match();
-        let bytes =
-            |points| pyramid_bytes(&expected_counts(points, 4), &limits, &[128, 256, 512, 1024]);
-        assert_eq!(expected_counts(27, 4), [27, 9, 3, 1]);
+        let bytes = |points| {
+            pyramid_bytes(
+                &[points, points / 3, points / 9, points / 27],
+                &limits,
+                &[128, 256, 512, 1024],
+            )
+        };
         assert!(bytes(30_000) < bytes(60_000) && bytes(30_000) < 1 << 30);
         assert!(bytes(10_000_000) > 20 << 30);
         assert_eq!(bytes(usize::MAX), u64::MAX);

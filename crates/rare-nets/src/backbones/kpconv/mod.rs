@@ -26,7 +26,7 @@ pub(crate) use blocks::{ConvolutionBlock, NormalizationKind, ResidualBlock, Unar
 pub use grid_subsampling::subsample;
 pub(in crate::backbones) use limits::usual_neighbours;
 pub use limits::{NeighbourLimits, calibrate};
-pub use memory::{expected_counts, pyramid_bytes};
+pub use memory::pyramid_bytes;
 pub use neighbours::{Neighbours, neighbours};
 pub use pyramid::{Pyramid, PyramidConfig, Stage, StagePoints};
 
